@@ -129,19 +129,24 @@ pub(crate) fn seen_by_turned(
 }
 
 impl Smoother {
-    /// Takes all observations as cameras would make them that are turned as the images are shifted, by the present shifts.
-    pub(crate) fn turn_shifted_pixels(&mut self) {
+    /// Takes all observations as cameras would make them that are turned as the images are shifted, by the present shifts; how far the farthest moved, px.
+    pub(crate) fn turn_shifted_pixels(&mut self) -> f64 {
         if self.config.image_shift_sigma().is_none() {
-            return;
+            return 0.0;
         }
+        let mut farthest = 0.0_f64;
         let (frames, camera) = (&self.frames, &self.camera);
-        let turn = |s: &mut LandmarkObservation| {
-            s.pixel = seen_by_turned(camera, &s.seen, &frames[s.frame].image_shift.turn).unwrap_or(s.seen);
+        let mut turn = |s: &mut LandmarkObservation| {
+            let turn = &frames[s.frame].image_shift.turn;
+            let pixel = seen_by_turned(camera, &s.seen, turn).unwrap_or(s.seen);
+            farthest = farthest.max((pixel - s.pixel).norm());
+            s.pixel = pixel;
         };
         for landmark in self.landmarks.iter_mut().filter(|l| l.alive) {
             turn(&mut landmark.host);
-            landmark.observations.iter_mut().for_each(turn);
+            landmark.observations.iter_mut().for_each(&mut turn);
         }
+        farthest
     }
 
     /// The state that IMU measurements since the newest frame lead to, of an image that is shifted as the stabiliser goes on.

@@ -46,7 +46,6 @@ impl Smoother {
 
     /// Builds the system at the present states and returns the robust cost.
     pub(crate) fn linearise(&mut self, system: &mut System, lambda: f64) -> f64 {
-        self.turn_shifted_pixels();
         system.begin(
             self.frames.len(),
             self.config.delay_sigma().is_some(),

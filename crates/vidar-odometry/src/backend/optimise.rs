@@ -56,6 +56,9 @@ const SCHEDULE: Schedule = Schedule {
 const FAILURE: Increase = Increase { acceleration: 4.0, least: 1e-3, ..Increase::by(4.0) };
 const LIMITS: Limits = Limits { damping: 1e8, ..Limits::NONE };
 
+/// Moves of pixels, by shifts of images that moved, that are not worth another descent, px.
+const SETTLED_PIXELS: f64 = 0.05;
+
 /// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; a delay 5 ms; a shift 0.01 rad; calibration
 /// 0.02 rad, 2 cm, 5 ms.
 ///
@@ -91,6 +94,18 @@ impl Smoother {
 
     /// As [`Smoother::optimise_into`], with a damping to begin with (larger for rough starts).
     pub(crate) fn optimise_from(&mut self, first: f64, max_iterations: usize, report: &mut OptimiseReport) {
+        self.turn_shifted_pixels();
+        self.descend(first, max_iterations, report);
+        // Where shifts of images moved, so did what a turned camera would have seen.
+        if self.turn_shifted_pixels() > SETTLED_PIXELS {
+            let (iterations, cost_before) = (report.iterations, report.cost_before);
+            self.descend(first, max_iterations, report);
+            (report.iterations, report.cost_before) = (iterations + report.iterations, cost_before);
+        }
+        self.find_outliers(report);
+    }
+
+    fn descend(&mut self, first: f64, max_iterations: usize, report: &mut OptimiseReport) {
         let mut system = std::mem::take(&mut self.system);
         let cost = self.linearise(&mut system, first);
         let calibration = self.calibration;
@@ -100,7 +115,6 @@ impl Smoother {
         (report.iterations, report.converged) = (done.trials, done.converged);
         (report.cost_before, report.cost_after) = (done.cost_before, done.cost_after);
         self.system = system;
-        self.find_outliers(report);
     }
 
     fn save(&self, system: &mut System) -> CalibrationState {

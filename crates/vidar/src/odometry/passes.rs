@@ -109,7 +109,8 @@ impl Passes<'_> {
     }
 
     /// Where the adjustment finds that image stamps scatter or images are shifted, all of it happens once more with an odometry that knows, and with
-    /// the calibration as adjusted where that is the recording's own. That result stands where it follows as many images.
+    /// the calibration as adjusted where that is the recording's own. That result stands where it follows as many images and explains
+    /// the recording as well.
     fn with_images_of_their_own(
         &mut self,
         recording: &TrackingInput<'_>,
@@ -143,7 +144,10 @@ impl Passes<'_> {
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = tracked.calibrated_again;
         let followed = |t: &Tracked| t.adjusted.as_ref().map_or(0, |a| a.images.len());
-        let is_better = followed(&again) >= followed(&tracked) && again.lost.len() <= tracked.lost.len();
+        let is_explained = |t: &Tracked| t.adjusted.as_ref().is_some_and(|a| a.report.is_explained());
+        let is_better = followed(&again) >= followed(&tracked)
+            && again.lost.len() <= tracked.lost.len()
+            && is_explained(&again) >= is_explained(&tracked);
         Ok(if is_better { again } else { tracked })
     }
 
