@@ -320,10 +320,12 @@ fn look(dataset: &Recording, events: &Events, cancel: &CancelToken) -> Result<Ca
             other.pixel_sigma
         )));
     }
-    if left.is_finite() && left > UNEXPLAINED_PX {
-        return Err(refuse(reason(CalibrationFailure::Unexplained)));
+    match found {
+        Ok(found) if found.pixel_sigma > UNEXPLAINED_PX => {
+            Err(refuse(reason(CalibrationFailure::Unexplained)))
+        }
+        found => found.map_err(|failure| refuse(reason(failure))),
     }
-    found.map_err(|failure| refuse(reason(failure)))
 }
 
 /// What a calibration leaves of the tracks, px, above which the gyroscope's signs are doubted: 0.1 to 0.2 in rendered recordings, 0.76 in the same

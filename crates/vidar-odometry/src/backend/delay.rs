@@ -1,37 +1,13 @@
 //! Delays of images whose stamps scatter: every frame has one, an unknown of the inertial factors on both of its sides.
 
 use super::Smoother;
+use super::own_value::OwnValue;
 use crate::imu::NavState;
-use nalgebra::{SVector, Vector3};
+use nalgebra::{SVector, Vector1, Vector3};
 use vidar_core::{LieGroup, Se3, So3};
 
-/// How much later than its stamp (plus the clock offset) an image was exposed.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Delay {
-    pub(crate) secs: f64,
-    /// `secs = linearised_secs + step_secs` once it is in the prior.
-    pub(crate) linearised_secs: f64,
-    pub(crate) step_secs: f64,
-    pub(crate) in_prior: bool,
-}
-
-impl Delay {
-    pub(crate) fn enter_prior(&mut self) {
-        if !self.in_prior {
-            self.in_prior = true;
-            self.relinearise();
-        }
-    }
-
-    pub(crate) fn relinearise(&mut self) {
-        (self.linearised_secs, self.step_secs) = (self.secs, 0.0);
-    }
-
-    pub(crate) fn apply(&mut self, step_secs: f64) {
-        self.secs += step_secs;
-        self.step_secs = self.secs - self.linearised_secs;
-    }
-}
+/// How much later than its stamp (plus the clock offset) an image was exposed, s.
+pub(crate) type Delay = OwnValue<1>;
 
 impl Smoother {
     /// Applies a frame's step. What of it follows from the later instant is the motion until then, of the state that it leads to: velocity times delay is
@@ -69,7 +45,7 @@ impl Smoother {
         let turn = So3::exp(&(rates.turn * delay_secs));
         state.world_from_body = Se3::new(from.rotation * turn, from.translation + shift);
         state.velocity += by * delay_secs;
-        frame.delay.apply(delay_secs);
+        frame.delay.apply(&Vector1::new(delay_secs));
         frame.step = frame.state.minus(&frame.linearised);
     }
 }

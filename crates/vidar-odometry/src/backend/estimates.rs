@@ -136,7 +136,7 @@ impl Smoother {
         for pair in self.frames.windows(2) {
             let Some(imu_factor) = &pair[1].imu_factor else { continue };
             let shift = linearise::shift_between(&self.calibration, &pair[0], &pair[1]);
-            let [from, to] = [0, 1].map(|k| self.body_of(&pair[k], &pair[k].state).state);
+            let [from, to] = [0, 1].map(|k| self.body_state_of(&pair[k]));
             let r = inertial::residual(&imu_factor.preintegration, &from, &to, shift);
             sum = (sum.0 + imu_factor.whitening.apply(&r).norm_squared(), sum.1 + 15.0);
         }

@@ -4,9 +4,10 @@
 //! would, up to the square of the angle from the axis, so only the inertial factors need to know how the body was turned.
 
 use super::Smoother;
+use super::own_value::OwnValue;
 use super::prior::Part;
 use super::system::System;
-use super::window::LandmarkObservation;
+use super::window::{Frame, LandmarkObservation};
 use crate::imu::{NavState, Preintegration, hat};
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 use vidar_core::{CameraModel, LieGroup, Se3, So3};
@@ -16,36 +17,7 @@ const LEAST_TURN_RAD: f64 = 0.01;
 const MOST_TURN_RAD: f64 = 0.02;
 
 /// By how much an image is turned about the camera's x and y, rad.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct ImageShift {
-    pub(crate) turn: Vector2<f64>,
-    /// `turn = linearised + step` once it is in the prior.
-    pub(crate) linearised: Vector2<f64>,
-    pub(crate) step: Vector2<f64>,
-    pub(crate) in_prior: bool,
-}
-
-impl ImageShift {
-    pub(crate) fn enter_prior(&mut self) {
-        if !self.in_prior {
-            self.in_prior = true;
-            self.relinearise();
-        }
-    }
-
-    pub(crate) fn relinearise(&mut self) {
-        (self.linearised, self.step) = (self.turn, Vector2::zeros());
-    }
-
-    pub(crate) fn apply(&mut self, step: Vector2<f64>) {
-        self.turn += step;
-        self.step = self.turn - self.linearised;
-    }
-
-    pub(crate) fn step_in_prior(&self) -> Option<Vector2<f64>> {
-        self.in_prior.then_some(self.step)
-    }
-}
+pub(crate) type ImageShift = OwnValue<2>;
 
 /// The body's state where the window's is that of the image, and its pose's derivatives by the image's rotation and by the shift.
 pub(crate) struct BodyState {
@@ -137,7 +109,7 @@ impl Smoother {
         let mut farthest = 0.0_f64;
         let (frames, camera) = (&self.frames, &self.camera);
         let mut turn = |s: &mut LandmarkObservation| {
-            let turn = &frames[s.frame].image_shift.turn;
+            let turn = &frames[s.frame].image_shift.now;
             let pixel = seen_by_turned(camera, &s.seen, turn).unwrap_or(s.seen);
             farthest = farthest.max((pixel - s.pixel).norm());
             s.pixel = pixel;
@@ -149,17 +121,22 @@ impl Smoother {
         farthest
     }
 
+    /// The body's state of a frame at the present states.
+    pub(crate) fn body_state_of(&self, frame: &Frame) -> NavState {
+        body_state(&frame.state, &frame.image_shift.now, &self.calibration.body_from_camera)
+    }
+
     /// The state that IMU measurements since the newest frame lead to, of an image that is shifted as the stabiliser goes on.
     pub(crate) fn predict(&self, preintegration: &Preintegration) -> NavState {
         let Some(newest) = self.frames.last() else { return NavState::REST };
         let camera = &self.calibration.body_from_camera;
-        let body = preintegration.predict(&body_state(&newest.state, &newest.image_shift.turn, camera));
+        let body = preintegration.predict(&self.body_state_of(newest));
         image_state(&body, &self.next_image_shift(Some(preintegration)), camera)
     }
 
     /// The shift that the next image has if the stabiliser goes on as in the window.
     pub(crate) fn next_image_shift(&self, preintegration: Option<&Preintegration>) -> Vector2<f64> {
-        let last = self.frames.last().map_or_else(Vector2::zeros, |f| f.image_shift.turn);
+        let last = self.frames.last().map_or_else(Vector2::zeros, |f| f.image_shift.now);
         let (Some(sigma), Some(preintegration)) = (self.config.image_shift_sigma(), preintegration) else {
             return last;
         };
@@ -186,7 +163,7 @@ impl Smoother {
             if turned.norm() > MOST_TURN_RAD {
                 continue;
             }
-            sums.0 -= turned.dot(&(pair[1].image_shift.turn - pair[0].image_shift.turn));
+            sums.0 -= turned.dot(&(pair[1].image_shift.now - pair[0].image_shift.now));
             sums.1 += turned.norm_squared();
         }
         (sums.0 / sums.1).clamp(0.0, 1.0)
@@ -196,7 +173,7 @@ impl Smoother {
     pub(crate) fn add_image_shift(&self, system: &mut System, k: usize) -> f64 {
         let Some(sigma) = self.config.image_shift_sigma() else { return 0.0 };
         let at = system.offset(Part::ImageShift(k));
-        let turn = self.frames[k].image_shift.turn;
+        let turn = self.frames[k].image_shift.now;
         for c in 0..2 {
             system.h[(at + c) * system.n + at + c] += 1.0 / (sigma * sigma);
             system.gradient[at + c] += turn[c] / (sigma * sigma);

@@ -14,7 +14,7 @@ use vidar_core::simd::kernel;
 /// How far the instants of two frames lie from where the IMU measurements between them were cut.
 pub(crate) fn shift_between(calibration: &CalibrationState, from: &Frame, to: &Frame) -> Shift {
     let now = calibration.time_offset_secs;
-    Shift { begin: now - from.clock_secs + from.delay.secs, end: now - to.clock_secs + to.delay.secs }
+    Shift { begin: now - from.clock_secs + from.delay.now.x, end: now - to.clock_secs + to.delay.now.x }
 }
 
 /// Inverse standard deviations of the calibration's own prior; 0 for what is not estimated.
@@ -134,7 +134,7 @@ impl Smoother {
     /// That a frame's delay is about zero.
     fn add_delay(&self, system: &mut System, k: usize) -> f64 {
         let Some(sigma) = self.config.delay_sigma() else { return 0.0 };
-        let (at, r) = (system.offset(Part::Delay(k)), self.frames[k].delay.secs / sigma);
+        let (at, r) = (system.offset(Part::Delay(k)), self.frames[k].delay.now.x / sigma);
         system.h[at * system.n + at] += 1.0 / (sigma * sigma);
         system.gradient[at] += r / sigma;
         0.5 * r * r

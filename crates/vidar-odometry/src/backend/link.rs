@@ -101,8 +101,8 @@ impl Smoother {
         let Some(imu_factor) = &to.imu_factor else { return 0.0 };
         let (measured, whitening) = (&imu_factor.preintegration, &imu_factor.whitening);
         let shift = shift_between(&self.calibration, from, to);
-        let (body_i, body_j) = (self.body_of(from, &from.state), self.body_of(to, &to.state));
-        let r = whitening.apply(&residual(measured, &body_i.state, &body_j.state, shift));
+        let (now_i, now_j) = (self.body_state_of(from), self.body_state_of(to));
+        let r = whitening.apply(&residual(measured, &now_i, &now_j, shift));
         let (body_i, body_j) =
             (self.body_of(from, &system.states_at[k - 1]), self.body_of(to, &system.states_at[k]));
         let (state_i, state_j) = (&body_i.state, &body_j.state);
@@ -144,11 +144,11 @@ impl Smoother {
         0.5 * r.norm_squared()
     }
 
-    /// The body's state of a frame, from the image's.
+    /// The body's state of a frame whose image has a state, with derivatives.
     pub(crate) fn body_of(&self, frame: &Frame, image: &NavState) -> BodyState {
         match self.config.image_shift_sigma() {
             None => BodyState::unshifted(image),
-            Some(_) => BodyState::new(image, &frame.image_shift.turn, &self.calibration.body_from_camera),
+            Some(_) => BodyState::new(image, &frame.image_shift.now, &self.calibration.body_from_camera),
         }
     }
 }

@@ -22,6 +22,7 @@ mod linearise;
 mod link;
 mod marginalise;
 mod optimise;
+mod own_value;
 mod prior;
 mod products;
 mod reprojection;
@@ -179,8 +180,7 @@ impl Smoother {
         }
         self.system.factorised = false;
         let clock_secs = self.next_frame_offset().as_secs_f64();
-        let turn = self.next_image_shift(preintegration.as_ref());
-        let image_shift = image_shift::ImageShift { turn, ..Default::default() };
+        let image_shift = image_shift::ImageShift::new(self.next_image_shift(preintegration.as_ref()));
         let frame = Frame::new(id, time, state, preintegration.map(ImuFactor::new));
         self.frames.push(Frame { clock_secs, image_shift, ..frame });
         Ok(())

@@ -185,7 +185,7 @@ impl Smoother {
             }
             if system.image_shifts > 0 {
                 let at = system.offset(Part::ImageShift(k));
-                self.frames[k].image_shift.apply(Vector2::new(system.step[at], system.step[at + 1]));
+                self.frames[k].image_shift.apply(&Vector2::new(system.step[at], system.step[at + 1]));
             }
         }
         if calibrates {

@@ -232,7 +232,7 @@ impl Prior {
             match *part {
                 Part::Pose(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[..6]),
                 Part::Motion(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[6..]),
-                Part::Delay(k) => self.step.push(frames[k].delay.step_secs),
+                Part::Delay(k) => self.step.push(frames[k].delay.step.x),
                 Part::ImageShift(k) => self.step.extend_from_slice(frames[k].image_shift.step.as_slice()),
                 Part::Calibration => self.step.extend_from_slice(calibration.step.as_slice()),
             }

@@ -11,7 +11,7 @@ use crate::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig,
     StepOutput,
 };
-use nalgebra::{DMatrix, DVector, SVector, Vector3};
+use nalgebra::{DMatrix, DVector, SVector, Vector1, Vector3};
 use vidar_core::{ImuNoise, LieGroup, So3};
 
 /// A smoother that flew for a while on a built-in flight.
@@ -209,7 +209,7 @@ fn the_gradient_is_the_slope_of_the_cost() {
     });
     let mut random = Random::new(4);
     for frame in &mut smoother.frames {
-        frame.image_shift.apply(Vector2::new(random.normal(), random.normal()) * 0.01);
+        frame.image_shift.apply(&(Vector2::new(random.normal(), random.normal()) * 0.01));
     }
     let mut system = System::default();
     smoother.linearise(&mut system, 0.0);
@@ -219,9 +219,9 @@ fn the_gradient_is_the_slope_of_the_cost() {
         let mut moved = smoother.clone();
         for (k, frame) in moved.frames.iter_mut().enumerate() {
             let [pose, delay] = [Part::Pose(k), Part::Delay(k)].map(|part| system.offset(part));
-            frame.delay.apply(sign * direction[delay]);
+            frame.delay.apply(&Vector1::new(sign * direction[delay]));
             let shift = system.offset(Part::ImageShift(k));
-            frame.image_shift.apply(Vector2::new(direction[shift], direction[shift + 1]) * sign);
+            frame.image_shift.apply(&(Vector2::new(direction[shift], direction[shift + 1]) * sign));
             let pose = SVector::<f64, 6>::from_fn(|i, _| sign * direction[pose + i]);
             let motion = SVector::<f64, 9>::from_fn(|i, _| sign * direction[9 * k + i]);
             frame.apply(&pose, &motion);

@@ -54,13 +54,11 @@ pub(crate) fn track(
     if adjustable.is_none() || !tracked.is_contradicted() || cancel.is_cancelled() {
         return Ok(tracked);
     }
-    let explained =
-        |again: &Tracked| again.adjusted.as_ref().filter(|a| a.report.is_explained()).map(|a| a.scale_std);
     if recording.config.odometry.image_shift_deg.is_none() {
         let mut config = config.clone();
         config.odometry.image_shift_deg = Some(IMAGE_SHIFT_RAD.to_degrees());
         let again = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
-        if explained(&again).is_some_and(|scale_std| scale_std < MOST_SCALE_STD) {
+        if again.explained().is_some_and(|a| a.scale_std < MOST_SCALE_STD) {
             return Ok(again);
         }
     }
@@ -70,7 +68,7 @@ pub(crate) fn track(
     let factor = &mut config.odometry.gyro_noise_factor;
     *factor = factor.max(DOUBTED_GYRO_NOISE_FACTOR);
     let again = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
-    Ok(if explained(&again).is_some() { again } else { tracked })
+    Ok(if again.explained().is_some() { again } else { tracked })
 }
 
 /// A recording and its settings with the calibration that an adjustment found.
@@ -117,37 +115,33 @@ impl Passes<'_> {
         tracked: Tracked,
     ) -> Result<Tracked, Error> {
         let TrackingInput { dataset, config, map } = *recording;
-        let finds = |a: &Adjusted, what: fn(&AdjustmentFinding) -> bool| a.findings.iter().any(what);
-        let scatter = |a: &Adjusted| {
-            config.odometry.stamp_scatter_ms.is_none()
-                && finds(a, |f| matches!(f, AdjustmentFinding::StampsScatter { .. }))
+        let settings = &config.odometry;
+        let is_open = [settings.stamp_scatter_ms.is_none(), settings.image_shift_deg.is_none()];
+        let finds = |what: fn(&AdjustmentFinding) -> bool| {
+            tracked.adjusted.as_ref().is_some_and(|a| a.findings.iter().any(what))
         };
-        let shifted = |a: &Adjusted| {
-            config.odometry.image_shift_deg.is_none()
-                && finds(a, |f| matches!(f, AdjustmentFinding::Shifted { .. }))
-        };
-        let first = tracked.adjusted.as_ref().filter(|a| scatter(a) || shifted(a));
+        let scatter = is_open[0] && finds(|f| matches!(f, AdjustmentFinding::StampsScatter { .. }));
+        let shifted = is_open[1] && finds(|f| matches!(f, AdjustmentFinding::Shifted { .. }));
+        let first = tracked.adjusted.as_ref().filter(|_| scatter || shifted);
         let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else {
             return Ok(tracked);
         };
         let is_own = dataset.calibration == CalibrationSource::Recording;
-        let is_told = [scatter(first), shifted(first)];
         let (dataset, mut config) =
             if is_own { as_adjusted(first, dataset, config) } else { (dataset.clone(), config.clone()) };
         let settings = &mut config.odometry;
-        if is_told[0] {
+        if scatter {
             settings.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
         }
-        if is_told[1] {
+        if shifted {
             settings.image_shift_deg = Some(IMAGE_SHIFT_RAD.to_degrees());
         }
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = tracked.calibrated_again;
         let followed = |t: &Tracked| t.adjusted.as_ref().map_or(0, |a| a.images.len());
-        let is_explained = |t: &Tracked| t.adjusted.as_ref().is_some_and(|a| a.report.is_explained());
         let is_better = followed(&again) >= followed(&tracked)
             && again.lost.len() <= tracked.lost.len()
-            && is_explained(&again) >= is_explained(&tracked);
+            && again.explained().is_some() >= tracked.explained().is_some();
         Ok(if is_better { again } else { tracked })
     }
 

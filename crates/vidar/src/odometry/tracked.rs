@@ -195,10 +195,15 @@ impl Tracked {
         StatedScale::new(source, None)
     }
 
+    /// What was adjusted, where that explains the recording.
+    pub(super) fn explained(&self) -> Option<&Adjusted> {
+        self.adjusted.as_ref().filter(|a| a.report.is_explained())
+    }
+
     /// Whether images and IMU contradict each other: the adjustment leaves more than noise explains, or there is none and most attempts to begin found so.
     pub(super) fn is_contradicted(&self) -> bool {
         let contradicts = match &self.adjusted {
-            Some(adjusted) => !adjusted.report.is_explained(),
+            Some(_) => self.explained().is_none(),
             None => self.quality.contradicts(),
         };
         self.with_imu && contradicts

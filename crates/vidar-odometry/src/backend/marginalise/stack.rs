@@ -9,7 +9,7 @@ use super::super::system::System;
 use super::super::window::{CALIBRATION_DIM, Landmark, OFFSET_AT};
 use super::Workspace;
 use crate::imu::Vector15;
-use nalgebra::{Matrix1, Matrix2, SMatrix, SVector, Vector1};
+use nalgebra::{Matrix1, Matrix2, SMatrix, SVector};
 
 impl Smoother {
     pub(super) fn stack_prior(&self, bench: &mut Workspace) {
@@ -39,11 +39,6 @@ impl Smoother {
         frame.motion_in_prior.then(|| frame.step.fixed_rows::<9>(6).into_owned())
     }
 
-    fn delay_step(&self, k: usize) -> Option<Vector1<f64>> {
-        let delay = &self.frames[k].delay;
-        delay.in_prior.then(|| Vector1::new(delay.step_secs))
-    }
-
     fn calibration_step(&self) -> Option<SVector<f64, CALIBRATION_DIM>> {
         self.calibration.in_prior.then_some(self.calibration.step)
     }
@@ -62,13 +57,9 @@ impl Smoother {
             };
             let (from, to) = (&self.frames[k - 1], &self.frames[k]);
             let shift = shift_between(&self.calibration, from, to);
-            let (body_i, body_j) = (self.body_of(from, &from.state), self.body_of(to, &to.state));
-            let r: Vector15 = imu_factor.whitening.apply(&residual(
-                &imu_factor.preintegration,
-                &body_i.state,
-                &body_j.state,
-                shift,
-            ));
+            let (now_i, now_j) = (self.body_state_of(from), self.body_state_of(to));
+            let r: Vector15 =
+                imu_factor.whitening.apply(&residual(&imu_factor.preintegration, &now_i, &now_j, shift));
             let (body_i, body_j) =
                 (self.body_of(from, &system.states_at[k - 1]), self.body_of(to, &system.states_at[k]));
             let (state_i, state_j) = (&body_i.state, &body_j.state);
@@ -98,19 +89,29 @@ impl Smoother {
             if self.config.delay_sigma().is_some() {
                 let ends = by_ends(&imu_factor.preintegration, state_i, state_j, shift);
                 for (k, by) in [k - 1, k].into_iter().zip(ends) {
-                    bench.put(row, Part::Delay(k), &imu_factor.whitening.apply(&by), self.delay_step(k));
+                    bench.put(
+                        row,
+                        Part::Delay(k),
+                        &imu_factor.whitening.apply(&by),
+                        self.frames[k].delay.step_in_prior(),
+                    );
                 }
             }
         }
         if let Some(sigma) = self.config.delay_sigma() {
             let row = bench.stack.add_rows(1);
-            bench.put_rhs(row, &[self.frames[motion].delay.secs / sigma]);
-            bench.put(row, Part::Delay(motion), &Matrix1::new(1.0 / sigma), self.delay_step(motion));
+            bench.put_rhs(row, &[self.frames[motion].delay.now.x / sigma]);
+            bench.put(
+                row,
+                Part::Delay(motion),
+                &Matrix1::new(1.0 / sigma),
+                self.frames[motion].delay.step_in_prior(),
+            );
         }
         if let Some(sigma) = self.config.image_shift_sigma() {
             let row = bench.stack.add_rows(2);
             let shift = &self.frames[motion].image_shift;
-            bench.put_rhs(row, (shift.turn / sigma).as_slice());
+            bench.put_rhs(row, (shift.now / sigma).as_slice());
             let by = Matrix2::identity() / sigma;
             bench.put(row, Part::ImageShift(motion), &by, shift.step_in_prior());
         }

@@ -80,7 +80,7 @@ fn shifts_of_images_are_found() {
             // A shift that all images share is a turn of the camera on the body: what is known is how they differ. A turn about y moves the picture to
             // the left, one about x down.
             let off = |f: &Frame| {
-                let turn = f.image_shift.turn;
+                let turn = f.image_shift.now;
                 Vector2::new(-turn.y, turn.x)
                     - images.settings().lens_at((f.time - begin).as_secs_f64()).shift
             };
