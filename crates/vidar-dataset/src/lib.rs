@@ -33,6 +33,7 @@ mod rig_checks;
 mod seven_scenes;
 mod source;
 mod spectacular;
+mod stabilised;
 mod stray_scanner;
 mod topics;
 mod trajectory_file;

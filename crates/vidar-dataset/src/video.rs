@@ -5,10 +5,12 @@ use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::location::Location;
 use crate::options::{OpenOptions, RecordingKind};
+use crate::stabilised;
 use crate::wrong_thing;
+use nalgebra::{Matrix3, Vector3};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use vidar_core::{Timestamp, Warning};
+use vidar_core::{Se3, So3, Timestamp, Warning};
 use vidar_video::{Telemetry, Video, VideoDecoder};
 
 /// The video of a folder that holds one and no images.
@@ -51,7 +53,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     let video = Video::open_with(path, options.decoder)?;
     let mut draft = Draft::new(RecordingKind::Video, path, format!("{reason}; {}", video.codec_name()));
     if let Some(telemetry) = video.telemetry()? {
-        take_telemetry(&mut draft, telemetry);
+        take_telemetry(&mut draft, &video, telemetry);
     }
     take_frames(&mut draft, path, video, None);
     Ok(draft)
@@ -85,7 +87,7 @@ pub(crate) fn take_frames(
     draft.media.video = Some(Arc::new(video));
 }
 
-fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
+fn take_telemetry(draft: &mut Draft, video: &Video, telemetry: Telemetry) {
     if telemetry.imu.is_empty() {
         return;
     }
@@ -106,12 +108,39 @@ fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
             "the telemetry does not state its axes; those published for the first cameras (Z, X, Y) are used";
         draft.warnings.push(Warning::new("telemetry-axes", message).at(&place));
     }
-    if telemetry.may_be_stabilised {
-        let message = "the camera states how it turned the picture against itself: with electronic stabilisation the \
-                       gyroscope does not describe the motion of the picture";
-        let warning = Warning::degraded("video-stabilised", message).at(&place);
-        draft.warnings.push(warning.hint("switch stabilisation off to record for a map"));
-    }
-    draft.assume_imu_noise("a video", telemetry.gyro_rate_hz, &place);
     draft.imu = telemetry.imu;
+    let frames: Vec<Timestamp> = video.times().collect();
+    match stabilised::with_the_picture(&draft.imu, &frames, &telemetry.turns) {
+        None => {}
+        Some(Ok(turned)) => {
+            let message = format!(
+                "the picture is stabilised: the camera turned it by up to {:.1}° against itself and states how; gyroscope and accelerometer are \
+                 turned with it",
+                turned.largest_rad.to_degrees()
+            );
+            draft.warnings.push(Warning::new("video-stabilised", message).at(&place));
+            draft.imu = turned.imu;
+        }
+        Some(Err(reason)) => {
+            let message = format!(
+                "the camera turned the picture against itself, and what it states of it is not used ({reason}): with electronic \
+                 stabilisation the gyroscope does not describe the motion of the picture"
+            );
+            let warning = Warning::degraded("video-stabilised", message).at(&place);
+            draft.warnings.push(warning.hint("switch stabilisation off to record for a map"));
+        }
+    }
+    assume_mount(draft, &place);
+    draft.assume_imu_noise("a video", telemetry.gyro_rate_hz, &place);
+}
+
+/// Uses the mount of GoPro cameras on the axes that their telemetry names: image right is −X, down −Z, ahead −Y. It is that of a GoPro MAX
+/// (from images and gyroscope); a HERO5 has gravity along Z, too. Which side the camera looks to is not stated.
+fn assume_mount(draft: &mut Draft, place: &str) {
+    let axes = Matrix3::new(-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0, 0.0);
+    let Some(rotation) = So3::from_matrix(&axes) else { return };
+    draft.cameras[draft.chosen].body_from_camera = Se3::new(rotation, Vector3::zeros());
+    let message = "the telemetry states no pose of the camera on the IMU; that of a GoPro MAX is assumed, at the IMU's position";
+    let warning = Warning::new("extrinsics-assumed", message).at(place);
+    draft.warnings.push(warning.hint("`vidar calibrate` finds the rotation; --calibration FILE gives it"));
 }

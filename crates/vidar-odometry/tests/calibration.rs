@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests may.
 
 use vidar_core::LieGroup;
-use vidar_odometry::calibration::{Calibration, CalibrationLog};
+use vidar_odometry::calibration::{Calibration, CalibrationLog, LensModel};
 use vidar_odometry::simulate::Handheld;
 
 /// Errors of one recording, and errors over standard deviations.
@@ -43,7 +43,7 @@ fn calibrate(truth: &Handheld) -> Calibration {
     for (stamp, features) in recording.images {
         log.add_image(stamp, features.into_iter());
     }
-    log.calibrate(truth.size.0, truth.size.1).unwrap()
+    log.calibrate(truth.size.0, truth.size.1, None).unwrap()
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
@@ -60,7 +60,7 @@ fn a_slow_hand_gives_what_its_standard_deviations_say_or_nothing() {
         let mut log = CalibrationLog::default();
         recording.samples.iter().for_each(|s| log.add_gyro(s));
         recording.images.into_iter().for_each(|(stamp, f)| log.add_image(stamp, f.into_iter()));
-        let Ok(found) = log.calibrate(truth.size.0, truth.size.1) else { continue };
+        let Ok(found) = log.calibrate(truth.size.0, truth.size.1, None) else { continue };
         let e = errors(&truth, &found);
         println!(
             "slow {seed}: f {:.2} % clock {:.2} ms turn {:.2} deg readout {:.2} ms {:.1?}",
@@ -78,6 +78,40 @@ fn a_slow_hand_gives_what_its_standard_deviations_say_or_nothing() {
     }
 }
 
+/// Action cameras: recordings as many as `VIDAR_CALIBRATION_DRAWS` says, a few by default.
+#[test]
+fn a_fisheye_is_told_from_a_pinhole_and_calibrated() {
+    let draws: u64 = std::env::var("VIDAR_CALIBRATION_DRAWS").map_or(4, |d| d.parse().unwrap());
+    let (mut all, mut beyond) = (Vec::new(), 0);
+    for seed in 0..draws {
+        let truth = Handheld::draw_fisheye(seed);
+        let found = calibrate(&truth);
+        let e = errors(&truth, &found);
+        println!(
+            "fisheye {seed}: {:?} f/w {:.2} k1 {:+.3} ({:+.3}) f {:.2} % clock {:.2} ms turn {:.2}° readout {:.2} ms {:.1?}",
+            found.lens,
+            truth.focal / 640.0,
+            truth.radial[0],
+            found.radial[0].value - truth.radial[0],
+            e.focal_percent,
+            e.clock_ms,
+            e.rotation_deg,
+            e.readout_ms,
+            e.sigmas
+        );
+        assert_eq!(found.lens, LensModel::Equidistant, "{seed}");
+        beyond += e.sigmas.iter().filter(|s| **s > 3.0).count();
+        all.push(e);
+    }
+    let of = |value: fn(&Errors) -> f64| median(all.iter().map(value).collect());
+    let medians = [of(|e| e.focal_percent), of(|e| e.clock_ms), of(|e| e.rotation_deg), of(|e| e.readout_ms)];
+    println!("medians {medians:.3?}, {beyond} of {} beyond 3 sigma", 4 * all.len());
+    for (found, goal) in medians.iter().zip([1.5, 3.0, 1.0, 4.0]) {
+        assert!(*found < goal, "median {found} above {goal}");
+    }
+    assert!(50 * beyond <= 4 * all.len(), "{beyond} beyond 3 sigma");
+}
+
 /// Recordings: a few by default, as many as `VIDAR_CALIBRATION_DRAWS` says for the table of docs/benchmark/odometry.md.
 #[test]
 fn twenty_seconds_by_hand_calibrate_camera_and_clock() {
@@ -89,6 +123,7 @@ fn twenty_seconds_by_hand_calibrate_camera_and_clock() {
         let truth = Handheld { secs, ..Handheld::draw(seed) };
         let begin = std::time::Instant::now();
         let found = calibrate(&truth);
+        assert_eq!(found.lens, LensModel::RadTan, "{seed}");
         let e = errors(&truth, &found);
         println!(
             "{seed}: f/w {:.2} k1 {:+.2} turn {:.2} move {:.2} px {:.2} ({:.2}) | f {:.2} % k1 {:+.3} k2 {:+.3} clock {:.2} ms turn {:.2}° readout {:.2} ms | sigmas {:.1?} | {:.1} s",

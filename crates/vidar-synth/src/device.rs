@@ -23,6 +23,15 @@ pub enum Lens {
         /// k1, k2, p1, p2 (OpenCV), −1…1.
         distortion: [f64; 4],
     },
+    /// A fisheye (equidistant, Kannala and Brandt), as of action cameras.
+    Equidistant {
+        /// Focal length in both directions, px, 8…20000.
+        focal_px: f64,
+        /// Principal point minus the image's centre, px, −500…500.
+        centre_offset_px: [f64; 2],
+        /// k1 to k4 (OpenCV's fisheye), −1…1.
+        distortion: [f64; 4],
+    },
 }
 
 /// Where and how the camera is mounted on the body (IMU).
@@ -132,7 +141,9 @@ impl Default for DeviceConfig {
 
 impl DeviceConfig {
     pub(crate) fn validate(&self) -> Result<(), SynthError> {
-        if let Lens::Radtan { focal_px, centre_offset_px, distortion } = self.lens {
+        if let Lens::Radtan { focal_px, centre_offset_px, distortion }
+        | Lens::Equidistant { focal_px, centre_offset_px, distortion } = self.lens
+        {
             within("device.lens.focal_px", focal_px, 8.0, 20_000.0, "8 to 20000 px")?;
             for offset in centre_offset_px {
                 within("device.lens.centre_offset_px", offset, -500.0, 500.0, "-500 to 500 px")?;

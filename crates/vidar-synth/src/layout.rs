@@ -83,11 +83,12 @@ fn transform_yaml(matrix: &[f64; 16]) -> String {
 const IDENTITY: [f64; 16] =
     [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 
-/// k1, k2, p1, p2 of a camera.
-pub(crate) fn distortion(camera: &CameraModel) -> [f64; 4] {
+/// Name and coefficients of a camera's distortion, as EuRoC's `sensor.yaml` has them: k1, k2, p1, p2, or k1 to k4 of a fisheye.
+pub(crate) fn distortion(camera: &CameraModel) -> (&'static str, [f64; 4]) {
     match camera {
-        CameraModel::RadTan(m) => m.distortion,
-        _ => [0.0; 4],
+        CameraModel::RadTan(m) => ("radial-tangential", m.distortion),
+        CameraModel::Equidistant(m) => ("equidistant", m.distortion),
+        _ => ("radial-tangential", [0.0; 4]),
     }
 }
 
@@ -110,7 +111,7 @@ pub(crate) fn camera_yaml(
     depth_units_per_metre: Option<u32>,
 ) -> String {
     let k = camera.intrinsics();
-    let distortion = distortion(camera);
+    let (model, distortion) = distortion(camera);
     let kind = if depth_units_per_metre.is_some() { "depth" } else { "camera" };
     let comment = if depth_units_per_metre.is_some() {
         "exact z-depth along the optical axis of cam0, registered to cam0's (distorted) pixels"
@@ -126,7 +127,7 @@ pub(crate) fn camera_yaml(
     let _ = write!(
         text,
         "\n# Camera specific definitions.\nrate_hz: {rate_hz}\nresolution: [{}, {}]\ncamera_model: pinhole\n\
-         intrinsics: [{:?}, {:?}, {:?}, {:?}] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n\
+         intrinsics: [{:?}, {:?}, {:?}, {:?}] #fu, fv, cu, cv\ndistortion_model: {model}\n\
          distortion_coefficients: {distortion:?}\n",
         k.width, k.height, k.fx, k.fy, k.cx, k.cy
     );

@@ -43,14 +43,13 @@ impl SynthConfig {
     #[must_use]
     pub fn resized(self, width: usize, height: usize) -> Self {
         let scale = width as f64 / self.width as f64;
-        let lens = match self.device.lens {
-            Lens::Radtan { focal_px, centre_offset_px, distortion } => Lens::Radtan {
-                focal_px: focal_px * scale,
-                centre_offset_px: centre_offset_px.map(|offset| offset * scale),
-                distortion,
-            },
-            Lens::Euroc => Lens::Euroc,
-        };
+        let mut lens = self.device.lens;
+        if let Lens::Radtan { focal_px, centre_offset_px, .. }
+        | Lens::Equidistant { focal_px, centre_offset_px, .. } = &mut lens
+        {
+            *focal_px *= scale;
+            centre_offset_px.iter_mut().for_each(|offset| *offset *= scale);
+        }
         Self { width, height, device: DeviceConfig { lens, ..self.device }, ..self }
     }
 

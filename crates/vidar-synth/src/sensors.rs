@@ -6,7 +6,7 @@ use crate::error::SynthError;
 use crate::random::{Gaussian, Purpose, stream};
 use crate::rig;
 use nalgebra::{Matrix3, Vector3};
-use vidar_core::camera::RadTan;
+use vidar_core::camera::{Equidistant, RadTan};
 use vidar_core::{CameraModel, LieGroup, Pinhole, Se3, So3};
 
 impl SynthConfig {
@@ -15,12 +15,17 @@ impl SynthConfig {
     /// # Errors
     /// A lens that is no valid camera of this size (distortion that folds the image).
     pub fn camera(&self) -> Result<CameraModel, SynthError> {
-        let Lens::Radtan { focal_px, centre_offset_px, distortion } = self.device.lens else {
+        let (Lens::Radtan { focal_px, centre_offset_px, distortion }
+        | Lens::Equidistant { focal_px, centre_offset_px, distortion }) = self.device.lens
+        else {
             return rig::euroc_camera(self.width, self.height);
         };
         let [dx, dy] = centre_offset_px;
         let (cx, cy) = (0.5 * (self.width as f64 - 1.0) + dx, 0.5 * (self.height as f64 - 1.0) + dy);
         let pinhole = Pinhole::new(focal_px, focal_px, cx, cy, self.width, self.height)?;
+        if matches!(self.device.lens, Lens::Equidistant { .. }) {
+            return Ok(CameraModel::Equidistant(Equidistant::new(pinhole, distortion)?));
+        }
         if distortion == [0.0; 4] {
             return Ok(CameraModel::Pinhole(pinhole));
         }
@@ -115,6 +120,16 @@ mod tests {
         let other = SynthConfig { seed: 2, ..config.clone() };
         assert_ne!(other.body_from_camera(), mount);
         assert_eq!(config.body_from_camera(), mount);
+    }
+
+    #[test]
+    fn a_fisheye_sees_by_the_angle() {
+        let lens = Lens::Equidistant { focal_px: 300.0, centre_offset_px: [0.0; 2], distortion: [0.0; 4] };
+        let device = DeviceConfig { lens, ..Default::default() };
+        let config = SynthConfig { width: 641, height: 481, device, ..Default::default() };
+        let seen = config.camera().unwrap().project(&Vector3::new(1.0, 0.0, 1.0)).unwrap();
+        assert!((seen.x - 320.0 - 300.0 * std::f64::consts::FRAC_PI_4).abs() < 1e-9, "{seen:?}");
+        assert_eq!(config.resized(1282, 962).camera().unwrap().intrinsics().fx, 600.0);
     }
 
     #[test]

@@ -17,6 +17,7 @@ pub(crate) fn truth_text(
     shots: &[Shot],
 ) -> Result<String, SynthError> {
     let k = camera.intrinsics();
+    let (model, distortion) = layout::distortion(camera);
     let [gyro_scale, accel_scale] = config.imu_scale();
     let noise = &config.imu_noise;
     let scale = config.imu_noise_scale;
@@ -26,9 +27,9 @@ pub(crate) fn truth_text(
         "schema": "vidar.synth-truth/1",
         "camera": {
             "resolution": [k.width, k.height],
-            "model": "pinhole with radial-tangential distortion",
+            "model": format!("pinhole with {model} distortion"),
             "intrinsics": [k.fx, k.fy, k.cx, k.cy],
-            "distortion": layout::distortion(camera),
+            "distortion": distortion,
             "body_from_camera": layout::mount_matrix(config),
             "readout_secs": config.device.readout_secs,
             "stabilisation": config.device.stabilisation,

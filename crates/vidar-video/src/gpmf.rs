@@ -19,10 +19,29 @@ pub struct Telemetry {
     pub accel_rate_hz: f64,
     /// Whether the axes are stated (`ORIN`) or those published for the older cameras.
     pub axes_are_stated: bool,
-    /// Whether the camera states how it moved the picture against itself (`CORI`, `IORI`): it may be stabilised.
-    pub may_be_stabilised: bool,
+    /// How the camera and, against it, the picture are turned, where the camera states it: it may be stabilised.
+    pub turns: StatedTurns,
     /// Units of gyroscope and accelerometer, as stated.
     pub units: [String; 2],
+}
+
+/// What a camera states of its stabiliser, one value a frame: quaternions, w first.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StatedTurns {
+    /// Turn of the camera since the recording began (`CORI`).
+    pub camera: Vec<[f64; 4]>,
+    /// Turn of the picture against the camera (`IORI`).
+    pub image: Vec<[f64; 4]>,
+    /// The axes, X 0 to Z 2, that the telemetry names its channels by. Quaternions seem to have the same order, without signs: those of a GoPro
+    /// MAX agree so with its gyroscope.
+    pub channels: [usize; 3],
+}
+
+impl StatedTurns {
+    /// Whether the camera states none.
+    pub fn is_empty(&self) -> bool {
+        self.camera.is_empty() && self.image.is_empty()
+    }
 }
 
 /// One entry.
@@ -83,8 +102,11 @@ struct Stream {
     /// For every payload: its time and duration, and the number of values up to its beginning.
     payloads: Vec<Payload>,
     unit: String,
-    has_axes: bool,
+    axes: Option<[(usize, f64); 3]>,
 }
+
+/// Without `ORIN` the order is Z, X, Y, as published for the first cameras with telemetry.
+const UNSTATED_AXES: [(usize, f64); 3] = [(2, 1.0), (0, 1.0), (1, 1.0)];
 
 #[derive(Clone, Copy)]
 struct Payload {
@@ -109,15 +131,17 @@ pub(crate) fn read(payloads: &[(i64, i64, Vec<u8>)]) -> Telemetry {
                         for (key, stream) in [(b"GYRO", &mut gyro), (b"ACCL", &mut accel)] {
                             stream.take(entry.data, key, (*time_ns, *duration_ns));
                         }
-                        telemetry.may_be_stabilised |=
-                            entries(entry.data).any(|e| matches!(&e.key, b"CORI" | b"IORI"));
+                        let turns = &mut telemetry.turns;
+                        take_quaternions(&mut turns.camera, entry.data, b"CORI");
+                        take_quaternions(&mut turns.image, entry.data, b"IORI");
                     }
                     _ => {}
                 }
             }
         }
     }
-    telemetry.axes_are_stated = gyro.has_axes && accel.has_axes;
+    telemetry.axes_are_stated = gyro.axes.is_some() && accel.axes.is_some();
+    telemetry.turns.channels = gyro.axes.unwrap_or(UNSTATED_AXES).map(|(axis, _)| axis);
     telemetry.units = [gyro.unit.clone(), accel.unit.clone()];
     let (gyro_times, accel_times) = (gyro.times(), accel.times());
     telemetry.gyro_rate_hz = rate_hz(&gyro_times);
@@ -141,10 +165,9 @@ impl Stream {
                     if channels != 3 {
                         continue;
                     }
-                    self.has_axes = axes.is_some();
+                    self.axes = axes;
                     self.payloads.push(Payload { time_ns, duration_ns, values_before: self.values.len() });
-                    // Without ORIN the order is Z, X, Y, as published for the first cameras with telemetry.
-                    let axes = axes.unwrap_or([(2, 1.0), (0, 1.0), (1, 1.0)]);
+                    let axes = axes.unwrap_or(UNSTATED_AXES);
                     for value in per_value.as_chunks::<3>().0 {
                         let mut vector = Vector3::zeros();
                         for (channel, (axis, sign)) in axes.iter().enumerate() {
@@ -181,6 +204,20 @@ impl Stream {
             }
         }
         (0..count).map(|i| start + slope * i as f64).collect()
+    }
+}
+
+/// Takes one payload's quaternions, where the stream has them under `key`.
+fn take_quaternions(all: &mut Vec<[f64; 4]>, stream: &[u8], key: &[u8; 4]) {
+    let mut scale = 1.0;
+    for entry in entries(stream) {
+        match &entry.key {
+            b"SCAL" => scale = entry.numbers().first().copied().unwrap_or(1.0),
+            found if found == key && all.len() < MAX_VALUES => {
+                all.extend(entry.numbers().as_chunks::<4>().0.iter().map(|q| q.map(|v| v / scale)));
+            }
+            _ => {}
+        }
     }
 }
 
@@ -253,7 +290,8 @@ mod tests {
         );
         let read = read(&[(0, second, bytes.clone()), (second, second, bytes)]);
         assert_eq!((read.device.as_str(), read.units), ("Camera", ["rad/s".to_string(), "m/s2".to_string()]));
-        assert!(read.axes_are_stated && !read.may_be_stabilised);
+        assert!(read.axes_are_stated && read.turns.is_empty());
+        assert_eq!(read.turns.channels, [1, 0, 2]);
         assert_eq!(read.imu[0].gyro.0, Vector3::new(-2.0, 1.0, 3.0));
         assert_eq!(read.imu[0].accel.0, Vector3::new(-2.0, 1.0, 3.0));
         // Half way between the accelerometer's values at 0 s and 0.5 s.
@@ -262,6 +300,20 @@ mod tests {
         assert!((read.gyro_rate_hz - 4.0).abs() < 1e-9 && (read.accel_rate_hz - 2.0).abs() < 1e-9);
         // The last accelerometer value is at 1.5 s; nothing is invented after it.
         assert_eq!(read.imu.last().map(|s| s.time.nanos()), Some(3 * second / 2));
+    }
+
+    #[test]
+    fn turns_of_camera_and_picture_are_one_a_frame() {
+        let stream = |key, values: &[i16]| {
+            let mut inside = entry(b"SCAL", b's', 2, &shorts(&[100]));
+            inside.extend(entry(key, b's', 8, &shorts(values)));
+            entry(b"STRM", 0, 1, &inside)
+        };
+        let mut device = stream(b"CORI", &[100, 0, 0, 0, 0, 100, 0, 0]);
+        device.extend(stream(b"IORI", &[60, 0, 80, 0]));
+        let read = read(&[(0, 1_000_000_000, entry(b"DEVC", 0, 1, &device))]);
+        assert_eq!(read.turns.camera, [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]);
+        assert_eq!((read.turns.image, read.turns.channels), (vec![[0.6, 0.0, 0.8, 0.0]], [2, 0, 1]));
     }
 
     #[test]

@@ -19,7 +19,7 @@ mod video;
 
 pub use error::VideoError;
 pub use ffmpeg::VideoDecoder;
-pub use gpmf::Telemetry;
+pub use gpmf::{StatedTurns, Telemetry};
 pub use lane::{AccessUnits, DECODER_THREAD};
 pub use stream::{StreamCodec, StreamUnit, VideoStream};
 pub use video::{Video, is_video};

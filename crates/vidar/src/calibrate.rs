@@ -1,17 +1,20 @@
 //! Calibration of a recording from the recording itself: `vidar calibrate`, and what `odometry` and `run` do where there is
 //! no calibration.
 
+mod missing;
 mod report;
 mod yaml;
+
+pub use missing::MissingCalibration;
 
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::imu_noise::believed_noise;
 use crate::input::{self, Measurement};
 use std::path::{Path, PathBuf};
-use vidar_core::camera::RadTan;
 use vidar_core::{
-    AngularRate, CameraModel, Duration, ImuNoise, ImuSample, Pinhole, RigCamera, Se3, SensorEvent, Warning,
+    AngularRate, CameraModel, Duration, ImuNoise, ImuSample, Pinhole, RigCamera, Se3, SensorEvent, So3,
+    Warning,
 };
 use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::OdometryConfig;
@@ -34,8 +37,16 @@ const MAX_FOCAL_SIGMA: f64 = 0.04;
 const MAX_CLOCK_SIGMA_MS: f64 = 10.0;
 
 /// Warnings of reading that complain of values which nobody gave.
-const OF_A_GUESS: [&str; 5] =
-    ["intrinsics-guessed", "imu-noise", "imu-noise-from-samples", "extrinsics-identity", "imu-rate"];
+const OF_A_GUESS: [&str; 6] = [
+    "intrinsics-guessed",
+    "imu-noise",
+    "imu-noise-from-samples",
+    "extrinsics-identity",
+    ASSUMED_MOUNT,
+    "imu-rate",
+];
+/// The warning of readers that know how cameras of a kind are mounted.
+const ASSUMED_MOUNT: &str = "extrinsics-assumed";
 
 /// What to calibrate.
 #[derive(Clone, Debug)]
@@ -129,11 +140,12 @@ fn write(path: &Path, text: &str) -> Result<(), Error> {
 }
 
 /// Whether nothing says how the camera is mounted on the IMU: a lens is given (by flags, or a file with intrinsics alone), and the
-/// readers took the IMU's own pose for it.
+/// readers took the IMU's own pose for it, or the usual one of such cameras.
 pub(crate) fn has_no_mount(dataset: &Recording) -> bool {
     dataset.calibration != CalibrationSource::Guessed
         && !dataset.imu.is_empty()
-        && dataset.rig.camera(dataset.camera).is_some_and(RigCamera::has_no_mount)
+        && (dataset.rig.camera(dataset.camera).is_some_and(RigCamera::has_no_mount)
+            || assumed_mount(dataset).is_some())
 }
 
 /// Whether a lens is given by its focal length and principal point alone: nobody measured it.
@@ -155,41 +167,6 @@ fn contradicts(found: &Calibration, given: &CameraModel) -> bool {
 
 /// Standard deviations from which a given lens is contradicted; as `vidar calibrate` reports it.
 const CONTRADICTING_SIGMAS: f64 = 3.0;
-
-/// What a recording with a gyroscope does not state of its calibration, and what therefore is looked for before it is tracked.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum MissingCalibration {
-    /// All of it: camera, mount and clock.
-    Camera,
-    /// How the camera is mounted on the IMU; a lens is given.
-    Mount,
-}
-
-impl MissingCalibration {
-    fn of(dataset: &Recording) -> Option<Self> {
-        if dataset.imu.is_empty() {
-            None
-        } else if dataset.calibration == CalibrationSource::Guessed {
-            Some(Self::Camera)
-        } else {
-            has_no_mount(dataset).then_some(Self::Mount)
-        }
-    }
-
-    /// What a run does about it.
-    pub fn words(self) -> &'static str {
-        match self {
-            Self::Camera => {
-                "none is given: a run finds it from images and gyroscope first, and ends with E0208 where they do not show it; until then there \
-                 are no poses, and camera and model view are a guess"
-            }
-            Self::Mount => {
-                "the camera's place on the IMU is not given: a run finds it from images and gyroscope first; where they do not show it, the \
-                 odometry starts with that of the IMU"
-            }
-        }
-    }
-}
 
 /// For a plan, which tracks nothing: the recording as if [`complete`] had found what is missing, with the values that were read or
 /// guessed. Says what is missing.
@@ -304,14 +281,14 @@ fn look(dataset: &Recording, events: &Events, cancel: &CancelToken) -> Result<Ca
             Measurement::Event(_) | Measurement::Stamp(_) | Measurement::Unreadable(..) => {}
         }
     }
-    let found = log.calibrate(width, height);
+    let found = log.calibrate(width, height, assumed_mount(dataset).as_ref());
     let is_doubtful = match &found {
         Ok(found) => found.pixel_sigma > DOUBTFUL_PX,
         Err(failure) => *failure == CalibrationFailure::Unexplained,
     };
     let left = found.as_ref().map_or(f64::INFINITY, |found| found.pixel_sigma);
     if is_doubtful
-        && let Ok(other) = opposite.calibrate(width, height)
+        && let Ok(other) = opposite.calibrate(width, height, None)
         && other.pixel_sigma < DOUBTFUL_PX.min(LEFT_BY_THE_RIGHT_SIGNS * left)
     {
         return Err(refuse(&format!(
@@ -348,6 +325,13 @@ fn reason(failure: CalibrationFailure) -> &'static str {
     }
 }
 
+/// The rotation body_from_camera of which a reader knows that cameras of this kind are mounted so.
+fn assumed_mount(dataset: &Recording) -> Option<So3> {
+    let is_assumed = dataset.warnings.iter().any(|w| w.kind == ASSUMED_MOUNT);
+    let camera = dataset.rig.camera(dataset.camera).filter(|_| is_assumed)?;
+    Some(camera.body_from_camera.rotation)
+}
+
 fn size_of(dataset: &Recording) -> (usize, usize) {
     dataset.rig.camera(dataset.camera).map_or((0, 0), |c| (c.model.width(), c.model.height()))
 }
@@ -356,9 +340,8 @@ fn size_of(dataset: &Recording) -> (usize, usize) {
 pub(crate) fn model_of(found: &Calibration, (width, height): (usize, usize)) -> Result<CameraModel, Error> {
     let f = found.focal_px.value;
     let [cx, cy] = found.centre_px.map(|c| c.value);
-    let [k1, k2] = found.radial.map(|k| k.value);
     let pinhole = Pinhole::new(f, f, cx, cy, width, height)?;
-    Ok(CameraModel::RadTan(RadTan::new(pinhole, [k1, k2, 0.0, 0.0])?))
+    Ok(found.lens.camera(pinhole, found.radial.map(|k| k.value))?)
 }
 
 /// Why a calibration that was found is too uncertain to be used without being asked for: rotation and focal length (unless a lens is given) not known

@@ -82,7 +82,11 @@ impl Draft {
         camera.time_offset = calibration.time_offset;
         camera.readout = calibration.readout;
         camera.rate_hz = calibration.rate_hz.or(camera.rate_hz);
-        camera.body_from_camera = body_from_camera.unwrap_or(camera.body_from_camera);
+        if let Some(given) = body_from_camera {
+            camera.body_from_camera = given;
+            // A reader's assumption holds no more.
+            self.warnings.retain(|w| w.kind != "extrinsics-assumed");
+        }
         camera.source = CalibrationSource::File(path.to_path_buf());
     }
 }

@@ -6,10 +6,11 @@
 //! calibration). Translation disturbs the images' rotations: this is a start to some degrees and some ten milliseconds, and
 //! tells the axis permutation.
 
+use super::lens::LensModel;
 use super::parameters::Parameters;
 use super::path::GyroPath;
 use crate::gyro_alignment::{ImageFeatures, common};
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix3, Vector3};
 use vidar_core::{LieGroup, So3, nearest_rotation};
 
 /// Matches that a pair of images needs.
@@ -19,8 +20,6 @@ const MIN_PAIRS: usize = 15;
 /// Clock offsets that are tried: ± this, in such steps, s.
 const SEARCH_SECS: f64 = 0.2;
 const STEP_SECS: f64 = 0.01;
-/// Trial focal lengths in image widths: fields of view from 90° to 39°.
-const FOCALS: [f64; 6] = [0.5, 0.62, 0.75, 0.9, 1.1, 1.4];
 
 /// A start for the refinement.
 #[derive(Clone, Copy, Debug)]
@@ -30,27 +29,20 @@ pub(super) struct Start {
     pub unexplained: f64,
 }
 
-/// Starts in the order of what they leave unexplained: the best clock offset of every trial focal length, and of the best
-/// focal length the second best offset. Empty where the body turned too little.
+/// Starts with a kind of lens in the order of what they leave unexplained: the best clock offset of every trial focal length, and
+/// of the best focal length the second best offset. The camera is mounted as `mount` says, else as the rates say. Empty where the
+/// body turned too little.
 pub(super) fn starts(
+    lens: LensModel,
+    mount: Option<&So3>,
     size: (f64, f64),
     images: &[ImageFeatures],
     path: &GyroPath,
     readout_secs: f64,
 ) -> Vec<Start> {
     let mut found: Vec<Start> = Vec::new();
-    for widths in FOCALS {
-        let parameters = Parameters {
-            focal: widths * size.0,
-            k1: 0.0,
-            k2: 0.0,
-            centre: Vector2::new(0.5 * (size.0 - 1.0), 0.5 * (size.1 - 1.0)),
-            offset_secs: 0.0,
-            readout_secs,
-            body_from_camera: So3::IDENTITY,
-            bias: Vector3::zeros(),
-            scale: Vector3::zeros(),
-        };
+    for widths in lens.trial_focals() {
+        let parameters = Parameters::plain(lens, widths * size.0, size, readout_secs);
         let seen = image_rates(&parameters, images);
         if seen.len() < MIN_PAIRS {
             return Vec::new();
@@ -68,7 +60,10 @@ pub(super) fn starts(
                         (turn.log() / (to - from), *seen)
                     })
                     .collect();
-                let (unexplained, body_from_camera, bias) = best_rotation(&rates)?;
+                let (unexplained, body_from_camera, bias) = match mount {
+                    Some(mount) => explained_by(mount, &rates),
+                    None => best_rotation(&rates)?,
+                };
                 let parameters = Parameters { offset_secs, body_from_camera, bias, ..parameters };
                 Some(Start { parameters, unexplained })
             })
@@ -98,6 +93,20 @@ fn image_rates(camera: &Parameters, images: &[ImageFeatures]) -> Vec<(f64, f64, 
         Some((before.secs, now.secs, rotation_between(&matches)? / secs))
     };
     images.windows(2).filter_map(rate).collect()
+}
+
+/// The share of the second rates that a rotation onto the first leaves unexplained, the rotation, and the difference of the means.
+fn explained_by(rotation: &So3, rates: &[(Vector3<f64>, Vector3<f64>)]) -> (f64, So3, Vector3<f64>) {
+    let n = rates.len() as f64;
+    let (a, b) = rates.iter().fold((Vector3::zeros(), Vector3::zeros()), |(a, b), r| (a + r.0, b + r.1));
+    let (mean_a, mean_b) = (a / n, rotation.act(&b) / n);
+    let (mut left, mut energy) = (0.0, 0.0);
+    for (felt, seen) in rates {
+        let (felt, seen) = (felt - mean_a, rotation.act(seen) - mean_b);
+        left += (felt - seen).norm_squared();
+        energy += felt.norm_squared() + seen.norm_squared();
+    }
+    (left / energy.max(1e-12), *rotation, mean_a - mean_b)
 }
 
 /// Rotation that maps the second rates of the pairs onto the first, means removed, the share of the second that it

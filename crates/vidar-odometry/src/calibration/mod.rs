@@ -10,6 +10,7 @@
 
 mod fixed;
 mod hand_eye;
+mod lens;
 mod noise;
 mod parameters;
 mod path;
@@ -18,16 +19,18 @@ mod stretches;
 #[cfg(test)]
 mod tests;
 mod tracker;
+mod tracks;
 mod window;
 
 use crate::gyro_alignment::{ImageFeatures, RateSample};
+pub use lens::LensModel;
 use nalgebra::Vector3;
 pub(crate) use noise::loud_noise;
 pub use noise::{SensorNoise, sensor_noise};
-use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, Parameters, READOUT, ROTATION, prior_sigmas};
+use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, READOUT, ROTATION, prior_sigmas};
 use path::GyroPath;
-use solve::Problem;
 pub use tracker::FeatureTracker;
+use tracks::{Solved, Tracks};
 use vidar_core::{ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
 
 /// Images nearer in time than this add little and cost as much, s.
@@ -85,7 +88,9 @@ pub struct Calibration {
     pub focal_px: Estimate,
     /// Principal point, pixels.
     pub centre_px: [Estimate; 2],
-    /// Radial distortion of the radial-tangential model.
+    /// The kind of lens that the next two belong to.
+    pub lens: LensModel,
+    /// Radial distortion, k1 and k2 of the lens.
     pub radial: [Estimate; 2],
     /// `t_imu = stamp + offset` for the centre row, s.
     pub time_offset_secs: Estimate,
@@ -95,6 +100,8 @@ pub struct Calibration {
     pub body_from_camera: So3,
     /// Standard deviation about each axis of the camera, rad.
     pub rotation_sigmas: [f64; 3],
+    /// Whether the mount was assumed, within some degrees, because the recording does not show it.
+    pub mount_is_assumed: bool,
     /// Whether the rotation is observable about every axis.
     pub rotation_is_observable: bool,
     /// Gyroscope bias, rad/s.
@@ -159,11 +166,18 @@ impl CalibrationLog {
         }
     }
 
-    /// Estimates the calibration of a camera with images of `width` × `height`.
+    /// Estimates the calibration of a camera with images of `width` × `height`. Where the body turns too little to show how the
+    /// camera is mounted, or about one axis only as in a hand that walks, the camera is taken as mounted as `assumed`, turned
+    /// about its view by quarter turns, or looking the other way.
     ///
     /// # Errors
     /// Says why the recording does not show it; never an error of the program.
-    pub fn calibrate(&self, width: usize, height: usize) -> Result<Calibration, CalibrationFailure> {
+    pub fn calibrate(
+        &self,
+        width: usize,
+        height: usize,
+        assumed: Option<&So3>,
+    ) -> Result<Calibration, CalibrationFailure> {
         let Some(origin) = self.images.first().map(|(t, _)| *t) else {
             return Err(CalibrationFailure::TooLittleData);
         };
@@ -193,50 +207,70 @@ impl CalibrationLog {
         if windows.iter().map(|w| w.turning(&samples)).fold(0.0, f64::max) < MIN_TURNING {
             return Err(CalibrationFailure::TooLittleRotation);
         }
-        let starts = hand_eye::starts(size, &images, &as_measured, START_READOUT_SECS);
-        let Some(first) = starts.first() else { return Err(CalibrationFailure::TooLittleRotation) };
-        let prior =
-            Parameters { focal: 0.75 * size.0, offset_secs: 0.0, bias: Vector3::zeros(), ..first.parameters };
         // From below: rates between samples are interpolated. From above: vibration is no white noise.
         let gyro_noise = sensor_noise(&self.samples).map_or(5e-4, |n| n.gyro).clamp(2e-4, 5e-3);
-        let problem = Problem { samples: &samples, width: size.0, prior, gyro_noise };
-        let starts: Vec<Parameters> = starts.iter().map(|s| s.parameters).collect();
-        let solution = problem.solve(&starts, &windows).ok_or(CalibrationFailure::Unexplained)?;
-        let [formal, spread] = problem.covariances(&solution).ok_or(CalibrationFailure::Unexplained)?;
-        let x = &solution.parameters;
-        let priors = prior_sigmas(size.0);
-        let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / windows.len() as f64);
-        let sigma = |p: usize| {
-            let floor = match p {
-                FOCAL => FOCAL_FLOOR,
-                READOUT => READOUT_SHARE * x.readout_secs,
-                _ if (CENTRE..CENTRE + 2).contains(&p) => CENTRE_FLOOR * size.0,
-                _ if (ROTATION..ROTATION + 3).contains(&p) => ROTATION_FLOOR,
-                _ => 0.0,
-            };
-            floor.hypot(factor * formal[(p, p)].max(spread[(p, p)]).sqrt())
+        let tracks = Tracks {
+            size,
+            images: &images,
+            samples: &samples,
+            as_measured: &as_measured,
+            gyro_noise,
+            windows: &windows,
         };
-        // Half of what is believed of any camera: more than that is the prior's, not the recording's.
-        let estimate = |p: usize, value: f64| Estimate {
-            value,
-            sigma: sigma(p),
-            is_observable: formal[(p, p)].sqrt() < 0.5 * priors[p],
+        let found = tracks.explained_by_any_lens(None).and_then(|solved| calibration(&tracks, &solved));
+        let is_decided = match &found {
+            Ok(found) => found.rotation_is_observable,
+            Err(failure) => *failure != CalibrationFailure::TooLittleRotation,
         };
-        let focal = estimate(FOCAL, x.focal);
-        let rotation_sigmas = [0, 1, 2].map(|a| sigma(ROTATION + a));
-        Ok(Calibration {
-            focal_px: Estimate { sigma: focal.sigma * x.focal, is_observable: focal.sigma < 0.1, ..focal },
-            centre_px: [estimate(CENTRE, x.centre.x), estimate(CENTRE + 1, x.centre.y)],
-            radial: [estimate(K1, x.k1), estimate(K2, x.k2)],
-            time_offset_secs: estimate(OFFSET, x.offset_secs),
-            readout_secs: estimate(READOUT, x.readout_secs),
-            body_from_camera: x.body_from_camera,
-            rotation_sigmas,
-            rotation_is_observable: rotation_sigmas.iter().all(|s| *s < 0.1),
-            gyro_bias: [0, 1, 2].map(|a| estimate(BIAS + a, x.bias[a])),
-            pixel_sigma: solution.noise.pixel,
-            images: images.len(),
-            stretches: windows.len(),
-        })
+        let Some(assumed) = assumed.filter(|_| !is_decided) else { return found };
+        let usual = calibration(&tracks, &tracks.explained_by_a_mount(assumed)?)?;
+        if usual.rotation_is_observable { Ok(usual) } else { Err(CalibrationFailure::TooLittleRotation) }
     }
+}
+
+/// A solution with its standard deviations.
+fn calibration(
+    tracks: &Tracks<'_>,
+    (problem, solution): &Solved<'_>,
+) -> Result<Calibration, CalibrationFailure> {
+    let width = tracks.size.0;
+    let stretches = tracks.windows.len();
+    let [formal, spread] = problem.covariances(solution).ok_or(CalibrationFailure::Unexplained)?;
+    let x = &solution.parameters;
+    let priors = prior_sigmas(x.lens, width);
+    let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / stretches as f64);
+    let sigma = |p: usize| {
+        let floor = match p {
+            FOCAL => FOCAL_FLOOR,
+            READOUT => READOUT_SHARE * x.readout_secs,
+            _ if (CENTRE..CENTRE + 2).contains(&p) => CENTRE_FLOOR * width,
+            _ if (ROTATION..ROTATION + 3).contains(&p) => ROTATION_FLOOR,
+            _ => 0.0,
+        };
+        floor.hypot(factor * formal[(p, p)].max(spread[(p, p)]).sqrt())
+    };
+    // Half of what is believed of any camera: more than that is the prior's, not the recording's.
+    let estimate = |p: usize, value: f64| Estimate {
+        value,
+        sigma: sigma(p),
+        is_observable: formal[(p, p)].sqrt() < 0.5 * priors[p],
+    };
+    let focal = estimate(FOCAL, x.focal);
+    let rotation_sigmas = [0, 1, 2].map(|a| sigma(ROTATION + a));
+    Ok(Calibration {
+        focal_px: Estimate { sigma: focal.sigma * x.focal, is_observable: focal.sigma < 0.1, ..focal },
+        centre_px: [estimate(CENTRE, x.centre.x), estimate(CENTRE + 1, x.centre.y)],
+        lens: x.lens,
+        radial: [estimate(K1, x.k1), estimate(K2, x.k2)],
+        time_offset_secs: estimate(OFFSET, x.offset_secs),
+        readout_secs: estimate(READOUT, x.readout_secs),
+        body_from_camera: x.body_from_camera,
+        rotation_sigmas,
+        mount_is_assumed: problem.mount_sigma.is_some(),
+        rotation_is_observable: rotation_sigmas.iter().all(|s| *s < 0.1),
+        gyro_bias: [0, 1, 2].map(|a| estimate(BIAS + a, x.bias[a])),
+        pixel_sigma: solution.noise.pixel,
+        images: tracks.images.len(),
+        stretches,
+    })
 }

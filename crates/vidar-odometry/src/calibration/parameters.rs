@@ -1,5 +1,6 @@
 //! What is estimated for the whole recording, and its prior.
 
+use super::lens::LensModel;
 use nalgebra::{Matrix2x3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::camera::Pixel;
 use vidar_core::{LieGroup, So3};
@@ -25,6 +26,8 @@ pub(super) type Tangent = SVector<f64, DIM>;
 /// Lens, clock, shutter, mount and gyroscope.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Parameters {
+    /// The family that focal length, k1 and k2 belong to; not estimated but tried.
+    pub lens: LensModel,
     /// Of both axes, pixels.
     pub focal: f64,
     pub k1: f64,
@@ -42,13 +45,12 @@ pub(crate) struct Parameters {
 
 /// What is believed before a recording is looked at.
 ///
-/// Focal length: anything from a tele lens to an action camera. Distortion: lenses of phones and of EuRoC have |k1| < 0.3.
-/// Principal point: within some per cent of the width. Readout: 0 (global shutter) to 33 ms. Gyroscope: data sheets of
+/// Focal length: anything from a tele lens to an action camera. Principal point: within some per cent of the width. Readout: 0 (global shutter) to 33 ms. Gyroscope: data sheets of
 /// consumer sensors state 1 to 3 % for the scale, phones are calibrated in the factory to half a per cent.
-pub(super) fn prior_sigmas(width: f64) -> Tangent {
-    let centre = 0.02 * width;
+pub(super) fn prior_sigmas(lens: LensModel, width: f64) -> Tangent {
+    let (centre, [k1, k2]) = (0.02 * width, lens.radial_sigmas());
     Tangent::from([
-        1.0, 0.3, 0.2, centre, centre, 0.2, 0.03, 3.0, 3.0, 3.0, 0.05, 0.05, 0.05, 0.007, 0.007, 0.007,
+        1.0, k1, k2, centre, centre, 0.2, 0.03, 3.0, 3.0, 3.0, 0.05, 0.05, 0.05, 0.007, 0.007, 0.007,
     ])
 }
 
@@ -60,10 +62,27 @@ pub(super) struct Projection {
 }
 
 impl Parameters {
+    /// A camera without distortion that sees the middle of the image straight ahead, in the body's axes, on the gyroscope's clock.
+    pub fn plain(lens: LensModel, focal: f64, size: (f64, f64), readout_secs: f64) -> Self {
+        Self {
+            lens,
+            focal,
+            k1: 0.0,
+            k2: 0.0,
+            centre: Vector2::new(0.5 * (size.0 - 1.0), 0.5 * (size.1 - 1.0)),
+            offset_secs: 0.0,
+            readout_secs,
+            body_from_camera: So3::IDENTITY,
+            bias: Vector3::zeros(),
+            scale: Vector3::zeros(),
+        }
+    }
+
     /// The parameters moved by a tangent vector.
     pub fn plus(&self, d: &Tangent) -> Self {
         let three = |at: usize| Vector3::new(d[at], d[at + 1], d[at + 2]);
         Self {
+            lens: self.lens,
             focal: self.focal * d[FOCAL].exp(),
             k1: self.k1 + d[K1],
             k2: self.k2 + d[K2],
@@ -76,7 +95,7 @@ impl Parameters {
         }
     }
 
-    /// `self − prior` as a tangent; the rotation has no prior and gives zero.
+    /// `self − prior` as a tangent, but for the rotation, which gives zero.
     pub fn minus(&self, prior: &Self) -> Tangent {
         let (c, b, s) = (self.centre - prior.centre, self.bias - prior.bias, self.scale - prior.scale);
         Tangent::from([
@@ -101,51 +120,15 @@ impl Parameters {
 
     /// Projects a point in camera axes; `None` behind the camera and where the distortion folds back.
     pub fn project(&self, p: &Vector3<f64>) -> Option<Projection> {
-        if !(p.z > 0.05 * p.norm()) {
-            return None;
-        }
-        let (iz, x, y) = (1.0 / p.z, p.x / p.z, p.y / p.z);
-        let r2 = x * x + y * y;
-        let d = 1.0 + r2 * (self.k1 + r2 * self.k2);
-        let slope = 1.0 + r2 * (3.0 * self.k1 + r2 * 5.0 * self.k2);
-        if !(slope > 0.05 && d > 0.05 && d < 5.0) {
-            return None;
-        }
-        let f = self.focal;
-        let dd = 2.0 * (self.k1 + 2.0 * r2 * self.k2);
-        let (xx, xy, yy) = (f * (d + x * x * dd), f * x * y * dd, f * (d + y * y * dd));
-        let d_point = Matrix2x3::new(
-            xx * iz,
-            xy * iz,
-            -(xx * x + xy * y) * iz,
-            xy * iz,
-            yy * iz,
-            -(xy * x + yy * y) * iz,
-        );
-        let (fx, fy) = (f * x, f * y);
-        let d_lens = SMatrix::<f64, 2, LENS>::from_row_slice(&[
-            fx * d,
-            fx * r2,
-            fx * r2 * r2,
-            1.0,
-            0.0,
-            fy * d,
-            fy * r2,
-            fy * r2 * r2,
-            0.0,
-            1.0,
-        ]);
-        Some(Projection { pixel: self.centre + Vector2::new(fx * d, fy * d), d_point, d_lens })
+        let seen = self.lens.project(self.focal, [self.k1, self.k2], p)?;
+        let [by_k1, by_k2] = [0, 1].map(|k| seen.d_radial.column(k).into_owned());
+        let d_lens =
+            SMatrix::<f64, 2, LENS>::from_columns(&[seen.at, by_k1, by_k2, Vector2::x(), Vector2::y()]);
+        Some(Projection { pixel: self.centre + seen.at, d_point: seen.d_point, d_lens })
     }
 
     /// Unit direction of a pixel in camera axes, by fixed-point iteration; good enough to start from.
     pub fn direction(&self, pixel: &Pixel) -> Vector3<f64> {
-        let seen = (pixel - self.centre) / self.focal;
-        let mut n = seen;
-        for _ in 0..8 {
-            let r2 = n.norm_squared();
-            n = seen / (1.0 + r2 * (self.k1 + r2 * self.k2)).max(0.3);
-        }
-        Vector3::new(n.x, n.y, 1.0).normalize()
+        self.lens.direction([self.k1, self.k2], &((pixel - self.centre) / self.focal))
     }
 }

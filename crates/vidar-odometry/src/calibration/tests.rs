@@ -1,6 +1,6 @@
 //! Derivatives, the tracker, noise, and what cannot be observed.
 
-use super::parameters::{DIM, Tangent};
+use super::parameters::{DIM, Parameters, Tangent};
 use super::path::GyroPath;
 use super::window::{Node, NodeObservation, Noise, Point, Window};
 use super::*;
@@ -46,6 +46,7 @@ fn small() -> (Window, Parameters, Vec<RateSample>) {
         })
         .collect();
     let parameters = Parameters {
+        lens: LensModel::RadTan,
         focal: 420.0,
         k1: -0.1,
         k2: 0.03,
@@ -109,7 +110,7 @@ fn steps_of_nodes_and_points_descend_to_the_optimum() {
 #[test]
 fn the_same_recording_gives_the_same_bits() {
     let log = log_of(&Handheld { secs: 6.0, ..Handheld::draw(3) });
-    let [a, b] = [log.calibrate(640, 480).unwrap(), log.calibrate(640, 480).unwrap()];
+    let [a, b] = [log.calibrate(640, 480, None).unwrap(), log.calibrate(640, 480, None).unwrap()];
     assert_eq!(a.focal_px.value.to_bits(), b.focal_px.value.to_bits());
     assert_eq!(a.time_offset_secs.sigma.to_bits(), b.time_offset_secs.sigma.to_bits());
 }
@@ -117,7 +118,7 @@ fn the_same_recording_gives_the_same_bits() {
 #[test]
 fn a_camera_at_rest_is_refused_or_not_observable() {
     let still = Handheld { turning: 1e-4, moving: 1e-4, ..Handheld::draw(4) };
-    match log_of(&still).calibrate(640, 480) {
+    match log_of(&still).calibrate(640, 480, None) {
         Err(failure) => assert_eq!(failure, CalibrationFailure::TooLittleRotation),
         Ok(found) => {
             assert!(!found.focal_px.is_observable && !found.time_offset_secs.is_observable, "{found:?}");
@@ -126,16 +127,63 @@ fn a_camera_at_rest_is_refused_or_not_observable() {
     }
 }
 
+/// How a camera is mounted cannot be seen where the body turns about one of its axes only, unless it is a camera of a known kind.
+#[test]
+fn turning_about_one_axis_calibrates_a_camera_that_is_mounted_as_usual() {
+    let side = So3::from_axis_angle(&Vector3::y(), std::f64::consts::PI);
+    let quarter = So3::from_axis_angle(&Vector3::z(), std::f64::consts::FRAC_PI_2);
+    let askew = So3::exp(&Vector3::new(0.02, -0.015, 0.01));
+    for seed in [2, 11] {
+        let motion = Handheld { main_axis: (1, 0.0), secs: 8.0, turning: 0.5, ..Handheld::draw(seed) };
+        let truth = Handheld { pixel_noise: 0.25, outliers: 0.02, ..motion };
+        let log = log_of(&truth);
+        let none = CalibrationFailure::TooLittleRotation;
+        assert_eq!(log.calibrate(640, 480, None).unwrap_err(), none, "{seed}");
+        let found = log.calibrate(640, 480, Some(&(truth.body_from_camera * askew))).unwrap();
+        let turn = (truth.body_from_camera.inverse() * found.body_from_camera).log();
+        let off = |found: &Estimate, truth: f64| (found.value - truth).abs() / found.sigma;
+        let sigmas = [
+            off(&found.focal_px, truth.focal),
+            off(&found.time_offset_secs, truth.offset_secs),
+            (0..3).map(|a| turn[a].abs() / found.rotation_sigmas[a]).fold(0.0, f64::max),
+        ];
+        assert!(found.mount_is_assumed && turn.norm() < 0.06, "{seed}: turned by {}", turn.norm());
+        assert!(sigmas.iter().all(|s| *s < 3.0), "{seed}: {sigmas:?}, {found:?}");
+        // None of these two is told from the one that is turned by half a turn about the body's axis.
+        for other in [quarter, quarter * side] {
+            let usual = truth.body_from_camera * askew * other;
+            match log.calibrate(640, 480, Some(&usual)) {
+                Err(failure) => assert_eq!(failure, none, "{seed}"),
+                Ok(found) => {
+                    let turn = (truth.body_from_camera.inverse() * found.body_from_camera).angle_rad();
+                    let half = (usual.inverse() * found.body_from_camera).angle_rad();
+                    assert!(
+                        turn < 0.06 || half < 0.06,
+                        "{seed}: turned by {turn}, {half} from what is usual"
+                    );
+                }
+            }
+        }
+    }
+    // Which way it looks shows as soon as the body turns a little about the others.
+    let motion = Handheld { main_axis: (1, 0.04), secs: 8.0, turning: 0.5, ..Handheld::draw(11) };
+    let truth = Handheld { pixel_noise: 0.25, outliers: 0.02, ..motion };
+    let usual = truth.body_from_camera * askew * quarter * side;
+    let found = log_of(&truth).calibrate(640, 480, Some(&usual)).unwrap();
+    let turn = (truth.body_from_camera.inverse() * found.body_from_camera).angle_rad();
+    assert!(found.mount_is_assumed && turn < 0.06, "turned by {turn}");
+}
+
 #[test]
 fn nothing_and_nonsense_are_refused() {
     let empty = CalibrationLog::default();
-    assert_eq!(empty.calibrate(640, 480).unwrap_err(), CalibrationFailure::TooLittleData);
+    assert_eq!(empty.calibrate(640, 480, None).unwrap_err(), CalibrationFailure::TooLittleData);
     let truth = Handheld { secs: 3.0, ..Handheld::draw(9) };
     let mut log = CalibrationLog::default();
     for sample in truth.record().samples {
         log.add_gyro(&ImuSample { gyro: AngularRate(Vector3::repeat(f64::NAN)), ..sample });
     }
-    assert_eq!(log.calibrate(640, 480).unwrap_err(), CalibrationFailure::TooLittleData);
+    assert_eq!(log.calibrate(640, 480, None).unwrap_err(), CalibrationFailure::TooLittleData);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! A hand-held camera with an unknown calibration, as feature tracks and gyroscope samples.
 
 use super::random::Random;
+use crate::calibration::LensModel;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use vidar_core::{
     AngularRate, ImuSample, LandmarkId, LieGroup, So3, SpecificForce, Timestamp, camera::Pixel,
@@ -22,7 +23,9 @@ pub struct Handheld {
     pub size: (usize, usize),
     /// Focal length, pixels.
     pub focal: f64,
-    /// First and second radial coefficient.
+    /// The kind of lens.
+    pub lens: LensModel,
+    /// Its first and second radial coefficient.
     pub radial: [f64; 2],
     /// Principal point, pixels.
     pub centre: Vector2<f64>,
@@ -46,6 +49,8 @@ pub struct Handheld {
     pub outliers: f64,
     /// Root mean square of the angular rate, rad/s.
     pub turning: f64,
+    /// The body's axis about which it turns most, and the share that the two others have.
+    pub main_axis: (usize, f64),
     /// Root mean square of the velocity, m/s.
     pub moving: f64,
     /// Length, s.
@@ -111,6 +116,7 @@ impl Handheld {
         Self {
             size: (640, 480),
             focal,
+            lens: LensModel::RadTan,
             radial: [k1, k2],
             centre: Vector2::new(319.5 + 0.01 * width * r.normal(), 239.5 + 0.01 * width * r.normal()),
             offset_secs: r.between(-0.1, 0.1),
@@ -123,16 +129,32 @@ impl Handheld {
             pixel_noise: r.between(0.3, 0.7),
             outliers: r.between(0.05, 0.1),
             turning: r.between(0.3, 1.2),
+            main_axis: (0, 1.0),
             moving: r.between(0.05, 0.5),
             secs: 20.0,
             seed,
         }
     }
 
+    /// The same with an action camera's fisheye: 100° to 140° over the width.
+    pub fn draw_fisheye(seed: u64) -> Self {
+        let narrow = Self::draw(seed);
+        let mut r = Random::new(seed ^ 0xf15e);
+        Self {
+            focal: 640.0 / r.between(100.0, 140.0_f64).to_radians(),
+            lens: LensModel::Equidistant,
+            radial: [r.between(-0.02, 0.06), r.between(-0.01, 0.01)],
+            ..narrow
+        }
+    }
+
     /// Records.
     pub fn record(&self) -> HandheldRecording {
         let mut r = Random::new(self.seed ^ 0x5eed);
-        let rates = Waves::new(&mut r, self.turning, 0.12, 2.0);
+        let waves = Waves::new(&mut r, self.turning, 0.12, 2.0);
+        let (main, others) = self.main_axis;
+        let shares = Vector3::from_fn(|axis, _| if axis == main { 1.0 } else { others });
+        let rates = |t: f64| waves.at(t).component_mul(&shares);
         let velocities = Waves::new(&mut r, self.moving, 0.08, 1.5);
         let begin = -0.6;
         let steps = ((self.secs + 1.2) / STEP_SECS) as usize;
@@ -141,12 +163,12 @@ impl Handheld {
         for k in 0..steps {
             orientations.push(turn);
             let middle = begin + (k as f64 + 0.5) * STEP_SECS;
-            turn = turn * So3::exp(&(rates.at(middle) * STEP_SECS));
+            turn = turn * So3::exp(&(rates(middle) * STEP_SECS));
         }
         let orientation = |t: f64| {
             let at = ((t - begin) / STEP_SECS).clamp(0.0, steps as f64 - 1.0);
             let k = at as usize;
-            orientations[k] * So3::exp(&(rates.at(t) * ((at - k as f64) * STEP_SECS)))
+            orientations[k] * So3::exp(&(rates(t) * ((at - k as f64) * STEP_SECS)))
         };
         // The body turns about a joint behind it, as a hand does.
         let joint = r.normal3() * 0.12;
@@ -161,7 +183,7 @@ impl Handheld {
         let noise = self.gyro_noise * GYRO_HZ.sqrt();
         for k in 0..((self.secs + 1.0) * GYRO_HZ) as usize {
             let t = -0.5 + k as f64 / GYRO_HZ;
-            let rate = rates.at(t);
+            let rate = rates(t);
             let measured = rate - rate.component_mul(&self.scale) + self.bias + r.normal3() * noise;
             out.samples.push(ImuSample {
                 time: stamp(t),
@@ -234,15 +256,12 @@ impl Handheld {
         for _ in 0..4 {
             let (world_from_camera, position) = camera(secs + late);
             let p = world_from_camera.inverse() * (point - position);
-            if p.z < 0.2 {
+            let [k1, k2] = self.radial;
+            let is_pinhole = self.lens == LensModel::RadTan;
+            if p.norm() < 0.2 || is_pinhole && (p.z < 0.2 || !is_one_to_one(k1, k2, p.xy().norm() / p.z)) {
                 return None;
             }
-            let n = Vector2::new(p.x / p.z, p.y / p.z);
-            let r2 = n.norm_squared();
-            if !is_one_to_one(self.radial[0], self.radial[1], r2.sqrt()) {
-                return None;
-            }
-            pixel = self.centre + n * (self.focal * (1.0 + r2 * (self.radial[0] + r2 * self.radial[1])));
+            pixel = self.centre + self.lens.project(self.focal, self.radial, &p)?.at;
             late = (pixel.y / (height - 1.0) - 0.5) * self.readout_secs;
         }
         let inside = pixel.x > 8.0 && pixel.y > 8.0 && pixel.x < width - 9.0 && pixel.y < height - 9.0;

@@ -21,6 +21,9 @@ pub(super) fn sentence(found: &Calibration, has_lens: bool) -> String {
 pub(super) fn values(found: &Calibration) -> String {
     let sigma = found.rotation_sigmas.iter().fold(0.0, |a: f64, s| a.max(*s)).to_degrees();
     let rotation = match found.rotation_is_observable {
+        true if found.mount_is_assumed => {
+            format!("rotation against the IMU within {sigma:.1}° (σ) of what is usual for such cameras")
+        }
         true => format!("rotation against the IMU within {sigma:.1}° (σ)"),
         false => "rotation against the IMU not observable in this recording".to_owned(),
     };
@@ -70,6 +73,7 @@ impl CalibrateOutcome {
             ("focal length", value(&c.focal_px, 1.0, "px", 1)),
             ("principal point x", value(&c.centre_px[0], 1.0, "px", 1)),
             ("principal point y", value(&c.centre_px[1], 1.0, "px", 1)),
+            ("lens", c.lens.kalibr_name().to_owned()),
             ("distortion k1", value(&c.radial[0], 1.0, "", 3)),
             ("distortion k2", value(&c.radial[1], 1.0, "", 3)),
             ("time offset", value(&c.time_offset_secs, 1e3, "ms", 2)),
@@ -118,7 +122,11 @@ impl CalibrateOutcome {
             })
             .collect();
         let sigmas = c.rotation_sigmas.map(f64::to_degrees);
-        let seen = if c.rotation_is_observable { "" } else { "; not observable in this recording" };
+        let seen = match (c.rotation_is_observable, c.mount_is_assumed) {
+            (_, true) => "; as such cameras are mounted, within 3°: the recording does not show it",
+            (true, false) => "",
+            (false, false) => "; not observable in this recording",
+        };
         format!(
             "camera {} of the IMU, nearly; ± {:.2}, {:.2}, {:.2}° about the camera's axes{seen}",
             axes.join(", "),
@@ -201,12 +209,14 @@ impl CalibrateOutcome {
             "resolution": [self.size.0, self.size.1],
             "focal_px": number(&c.focal_px),
             "centre_px": c.centre_px.iter().map(number).collect::<Vec<_>>(),
+            "lens": c.lens.kalibr_name(),
             "radial": c.radial.iter().map(number).collect::<Vec<_>>(),
             "time_offset_secs": number(&c.time_offset_secs),
             "readout_secs": number(&c.readout_secs),
             "body_from_camera": rows,
             "rotation_sigmas_rad": c.rotation_sigmas,
             "rotation_observable": c.rotation_is_observable,
+            "mount_assumed": c.mount_is_assumed,
             "gyro_bias": c.gyro_bias.iter().map(number).collect::<Vec<_>>(),
             "gyro_noise": self.noise.map(|n| n.gyro),
             "accel_noise": self.noise.map(|n| n.accel),

@@ -30,7 +30,7 @@ impl CalibrateOutcome {
             "  intrinsics: [{:.4}, {:.4}, {:.4}, {:.4}]",
             c.focal_px.value, c.focal_px.value, cx.value, cy.value
         ));
-        line("  distortion_model: radtan".into());
+        line(format!("  distortion_model: {}", c.lens.kalibr_name()));
         line(format!("  # {}", told("k1", &k1, 1.0, "", 4)));
         line(format!("  # {}", told("k2", &k2, 1.0, "", 4)));
         line(format!("  distortion_coeffs: [{:.6}, {:.6}, 0.0, 0.0]", k1.value, k2.value));
