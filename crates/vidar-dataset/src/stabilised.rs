@@ -74,20 +74,22 @@ fn turned(imu: &[ImuSample], frames: &[Timestamp], stated: &StatedTurns) -> Resu
     }
     let Some(image) = rotations(&stated.image[..least], order) else { return Err(NO_ROTATIONS.into()) };
     let secs: Vec<f64> = frame_secs.iter().map(|s| s + offset_secs).collect();
-    let picture: Vec<So3> = secs.iter().zip(image).map(|(s, turn)| path.at(*s) * turn).collect();
+    let picture: Vec<So3> = secs.iter().zip(&image).map(|(s, turn)| path.at(*s) * *turn).collect();
+    let (first, last) = (0, least - 1);
     let sample = |s: &ImuSample| {
         let at = (s.time - *origin).as_secs_f64();
-        let first = secs.partition_point(|f| *f <= at).clamp(1, secs.len() - 1) - 1;
-        let rate = (picture[first].inverse() * picture[first + 1]).log() / (secs[first + 1] - secs[first]);
-        let start_from_picture = picture[first] * So3::exp(&(rate * (at - secs[first])));
-        let picture_from_camera = start_from_picture.inverse() * path.at(at);
-        let is_between = at >= secs[0] && at <= secs[secs.len() - 1];
-        ImuSample {
-            time: s.time,
-            // Before the first frame and after the last one the picture turns with the camera.
-            gyro: AngularRate(if is_between { rate } else { picture_from_camera.act(&s.gyro.0) }),
-            accel: SpecificForce(picture_from_camera.act(&s.accel.0)),
-        }
+        // Before the first frame and after the last one the picture turns with the camera.
+        let (picture_from_camera, gyro) = if at < secs[first] || at >= secs[last] {
+            let turn = image[if at < secs[first] { first } else { last }].inverse();
+            (turn, turn.act(&s.gyro.0))
+        } else {
+            let k = secs.partition_point(|f| *f <= at) - 1;
+            let rate = (picture[k].inverse() * picture[k + 1]).log() / (secs[k + 1] - secs[k]);
+            let start_from_picture = picture[k] * So3::exp(&(rate * (at - secs[k])));
+            (start_from_picture.inverse() * path.at(at), rate)
+        };
+        let accel = SpecificForce(picture_from_camera.act(&s.accel.0));
+        ImuSample { time: s.time, gyro: AngularRate(gyro), accel }
     };
     Ok(imu.iter().map(sample).collect())
 }
@@ -215,6 +217,10 @@ mod tests {
                 let felt = path.at(from).inverse() * path.at(to);
                 worst = worst.max((felt.inverse() * (picture(from).inverse() * picture(to))).angle_rad());
             }
+            // Outside of the frames the picture stays where it is on the camera.
+            let norms = |all: &[ImuSample]| (all[3].gyro.0.norm(), all[1030].gyro.0.norm());
+            let (before, now) = (norms(&imu), norms(&turned.imu));
+            assert!((before.0 - now.0).abs() < 1e-9 && (before.1 - now.1).abs() < 1e-9);
             for sample in &turned.imu[100..900] {
                 let at = (sample.time - frames[0]).as_secs_f64();
                 tilt = tilt.max((picture(at).act(&sample.accel.0) - Vector3::new(0.0, 0.0, 9.8)).norm());
