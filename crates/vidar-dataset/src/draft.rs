@@ -14,11 +14,15 @@ use crate::recording::{CalibrationSource, ExternalTrajectory, ImageEntry, Record
 use crate::rig_checks;
 use crate::trajectory_file::{self, ReadPoses};
 use crate::tum_rgbd;
+use nalgebra::Vector3;
 use std::path::{Path, PathBuf};
 use vidar_core::{
-    BodyFrame, CameraId, CameraModel, Duration, FrameId, ImuNoise, ImuSample, Rig, RigCamera, Se3,
+    BodyFrame, CameraId, CameraModel, Duration, FrameId, ImuNoise, ImuSample, Rig, RigCamera, Se3, So3,
     StampedPose, Timestamp, Trajectory, Warning,
 };
+
+/// The warning that the camera's mount is an assumption of the reader.
+pub(crate) const ASSUMED_MOUNT: &str = "extrinsics-assumed";
 
 /// A camera of the dataset whose calibration is not complete yet.
 pub(crate) struct DraftCamera {
@@ -128,6 +132,15 @@ impl Draft {
         let warning = Warning::new("imu-noise", message).at(place);
         self.warnings.push(warning.hint("--calibration imu.yaml (Kalibr)"));
         self.imu_noise = Some(ImuNoise { rate_hz, ..ImuNoise::EUROC });
+    }
+
+    /// Uses the mount `body_from_camera` that is usual for cameras of this kind, at the IMU's position, until a calibration gives another.
+    pub(crate) fn assume_mount(&mut self, body_from_camera: So3, message: &str) {
+        if let Some(camera) = self.cameras.get_mut(self.chosen) {
+            camera.body_from_camera = Se3::new(body_from_camera, Vector3::zeros());
+        }
+        let warning = Warning::new(ASSUMED_MOUNT, message).at(self.root.display());
+        self.warnings.push(warning.hint("`vidar calibrate` finds the rotation; --calibration FILE gives it"));
     }
 
     /// Completes the dataset. The order of the steps follows their dependencies.

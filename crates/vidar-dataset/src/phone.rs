@@ -2,7 +2,7 @@
 
 use crate::draft::Draft;
 use nalgebra::{Matrix3, Vector3};
-use vidar_core::{LieGroup, Se3, So3, Warning};
+use vidar_core::{LieGroup, So3, Warning};
 
 /// Orientation of a back camera, as its sensor delivers its rows, on the phone's IMU axes (x right, y up, z out of the screen, the same
 /// on Android and iOS). The longer side of the image lies along the phone: image right is −y, image down is −x, the view is −z.
@@ -32,14 +32,9 @@ pub(crate) fn assume_mount(draft: &mut Draft, quarter_turns: u8) {
     if draft.imu.is_empty() {
         return;
     }
-    let imu_from_camera = camera_from_imu(quarter_turns).inverse();
-    if let Some(camera) = draft.cameras.get_mut(draft.chosen) {
-        camera.body_from_camera = Se3::new(imu_from_camera, Vector3::zeros());
-    }
     let message = "the recorder states no pose of the camera on the IMU; a back camera with the usual orientation is \
                    assumed, at the IMU's position (true within some centimetres)";
-    let warning = Warning::new("extrinsics-assumed", message).at(draft.root.display());
-    draft.warnings.push(warning.hint("`vidar calibrate` finds the rotation; --calibration FILE gives it"));
+    draft.assume_mount(camera_from_imu(quarter_turns).inverse(), message);
 }
 
 /// Compares the mean direction of the specific force with the vertical of the recorder's poses, of which `up` is an axis; turns the sign of

@@ -7,10 +7,10 @@ use crate::location::Location;
 use crate::options::{OpenOptions, RecordingKind};
 use crate::stabilised;
 use crate::wrong_thing;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Matrix3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use vidar_core::{Se3, So3, Timestamp, Warning};
+use vidar_core::{So3, Timestamp, Warning};
 use vidar_video::{Telemetry, Video, VideoDecoder};
 
 /// The video of a folder that holds one and no images.
@@ -130,17 +130,15 @@ fn take_telemetry(draft: &mut Draft, video: &Video, telemetry: Telemetry) {
             draft.warnings.push(warning.hint("switch stabilisation off to record for a map"));
         }
     }
-    assume_mount(draft, &place);
+    assume_mount(draft);
     draft.assume_imu_noise("a video", telemetry.gyro_rate_hz, &place);
 }
 
 /// Uses the mount of GoPro cameras on the axes that their telemetry names: image right is −X, down −Z, ahead −Y. It is that of a GoPro MAX
 /// (from images and gyroscope); a HERO5 has gravity along Z, too. Which side the camera looks to is not stated.
-fn assume_mount(draft: &mut Draft, place: &str) {
+fn assume_mount(draft: &mut Draft) {
     let axes = Matrix3::new(-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0, 0.0);
     let Some(rotation) = So3::from_matrix(&axes) else { return };
-    draft.cameras[draft.chosen].body_from_camera = Se3::new(rotation, Vector3::zeros());
     let message = "the telemetry states no pose of the camera on the IMU; that of a GoPro MAX is assumed, at the IMU's position";
-    let warning = Warning::new("extrinsics-assumed", message).at(place);
-    draft.warnings.push(warning.hint("`vidar calibrate` finds the rotation; --calibration FILE gives it"));
+    draft.assume_mount(rotation, message);
 }

@@ -1,6 +1,6 @@
 //! Calibration files that a recording is given, and those beside it that are not read.
 
-use super::Draft;
+use super::{ASSUMED_MOUNT, Draft};
 use crate::error::DatasetError;
 use crate::parse::{self, Source};
 use crate::recording::CalibrationSource;
@@ -85,7 +85,7 @@ impl Draft {
         if let Some(given) = body_from_camera {
             camera.body_from_camera = given;
             // A reader's assumption holds no more.
-            self.warnings.retain(|w| w.kind != "extrinsics-assumed");
+            self.warnings.retain(|w| w.kind != ASSUMED_MOUNT);
         }
         camera.source = CalibrationSource::File(path.to_path_buf());
     }
