@@ -32,7 +32,7 @@ impl MissingCalibration {
             }
             Self::Mount => {
                 "the camera's place on the IMU is not given: a run finds it from images and gyroscope first; where they do not show it, the \
-                 odometry starts with that of the IMU"
+                 odometry starts with the one that was read or assumed"
             }
         }
     }
