@@ -152,7 +152,7 @@ pub(super) fn eliminate(
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::observation::{self, tests::example};
     use super::super::problem::{CalibrationPrior, FrameState, ObservedLandmark, WhitenedObservation};
     use super::*;
@@ -162,7 +162,7 @@ mod tests {
     use vidar_core::{LensMotion, Timestamp};
 
     /// Three states that see four landmarks where they are, with the clock among the unknowns.
-    fn problem() -> Problem {
+    pub(in super::super) fn problem() -> Problem {
         let (body, landmark, calibration, measured) = example();
         let mut frames = Vec::new();
         for frame in 0..3 {
