@@ -166,9 +166,9 @@ odometry() {
     done
     step odometry-tumvi "$EXAMPLES/evaluate" --adjust "${rooms[@]}"
     step odometry-time "$EXAMPLES/evaluate" --repeat 3 --stages "$DATA/euroc_MH_01_real_11s" "${flights[3]}"
-    step odometry-starts cargo test --release -p vidar-odometry --test starts -- --ignored --nocapture
-    step odometry-ladder cargo test --release -p vidar-odometry --test ladder -- --include-ignored --nocapture
-    step odometry-consistency cargo test --release -p vidar-odometry --test monte_carlo -- --ignored --nocapture
+    step odometry-starts cargo test --release -p vidar-odometry --test flights starts -- --ignored --nocapture
+    step odometry-ladder cargo test --release -p vidar-odometry --test flights ladder -- --include-ignored --nocapture
+    step odometry-consistency cargo test --release -p vidar-odometry --test flights monte_carlo -- --ignored --nocapture
 }
 
 ordinary() {
@@ -212,7 +212,7 @@ align() {
     step build-align cargo build --release -p vidar-align --examples
     step align-overlap "$PYTHON" bench/align_vs_reference.py --binary "$EXAMPLES/align_overlap"
     step align-graph "$PYTHON" bench/graph_vs_reference.py --binary "$EXAMPLES/solve_graphs"
-    step align-regimes cargo test --release -p vidar-align --test aligner_regimes -- --nocapture
+    step align-regimes cargo test --release -p vidar-align --test alignment aligner_regimes -- --nocapture
 }
 
 fusion() {
@@ -247,7 +247,7 @@ da3() {
     step build-da3 cargo build --release -p vidar-da3 --example time_da3
     step da3-speed "$PYTHON" bench/da3_vs_torch.py --ours "$EXAMPLES/time_da3" --models da3-small da3-base \
         --views 1 4 8 16 --out "$OUT/da3.json"
-    step da3-parity cargo test --release -p vidar-da3 --test official_goldens -- --ignored --nocapture
+    step da3-parity cargo test --release -p vidar-da3 --test network official_goldens -- --ignored --nocapture
 }
 
 nano() {

@@ -3,7 +3,7 @@
 #![allow(clippy::expect_used, reason = "a benchmark may stop at the first surprise")]
 
 #[allow(dead_code, reason = "the benchmark needs no exact depth")]
-#[path = "../tests/scene/mod.rs"]
+#[path = "../tests/depth/scene/mod.rs"]
 mod scene;
 
 use scene::{WALL, poses, views};

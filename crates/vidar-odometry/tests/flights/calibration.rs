@@ -1,0 +1,160 @@
+//! Calibration from nothing on simulated hand-held recordings: tracks with outliers, rolling shutter, a late clock, any
+//! mount, a distorted lens, a consumer gyroscope.
+
+use vidar_core::LieGroup;
+use vidar_odometry::calibration::{Calibration, CalibrationLog, LensModel};
+use vidar_odometry::simulate::Handheld;
+
+/// Errors of one recording, and errors over standard deviations.
+struct Errors {
+    focal_percent: f64,
+    clock_ms: f64,
+    rotation_deg: f64,
+    readout_ms: f64,
+    sigmas: [f64; 4],
+}
+
+fn errors(truth: &Handheld, found: &Calibration) -> Errors {
+    let focal = found.focal_px.value - truth.focal;
+    let clock = found.time_offset_secs.value - truth.offset_secs;
+    let readout = found.readout_secs.value - truth.readout_secs;
+    let turn = (truth.body_from_camera.inverse() * found.body_from_camera).log();
+    let worst = (0..3).map(|a| turn[a].abs() / found.rotation_sigmas[a]).fold(0.0, f64::max);
+    Errors {
+        focal_percent: 100.0 * focal.abs() / truth.focal,
+        clock_ms: 1e3 * clock.abs(),
+        rotation_deg: turn.norm().to_degrees(),
+        readout_ms: 1e3 * readout.abs(),
+        sigmas: [
+            focal.abs() / found.focal_px.sigma,
+            clock.abs() / found.time_offset_secs.sigma,
+            worst,
+            readout.abs() / found.readout_secs.sigma,
+        ],
+    }
+}
+
+fn calibrate(truth: &Handheld) -> Calibration {
+    let recording = truth.record();
+    let mut log = CalibrationLog::default();
+    recording.samples.iter().for_each(|s| log.add_gyro(s));
+    for (stamp, features) in recording.images {
+        log.add_image(stamp, features.into_iter());
+    }
+    log.calibrate(truth.size.0, truth.size.1, None).unwrap()
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Slow or short recordings may tell little, but what they tell holds.
+#[test]
+fn a_slow_hand_gives_what_its_standard_deviations_say_or_nothing() {
+    for seed in 0..4 {
+        let truth = Handheld { turning: 0.06, moving: 0.1, secs: 10.0, ..Handheld::draw(seed) };
+        let recording = truth.record();
+        let mut log = CalibrationLog::default();
+        recording.samples.iter().for_each(|s| log.add_gyro(s));
+        recording.images.into_iter().for_each(|(stamp, f)| log.add_image(stamp, f.into_iter()));
+        let Ok(found) = log.calibrate(truth.size.0, truth.size.1, None) else { continue };
+        let e = errors(&truth, &found);
+        println!(
+            "slow {seed}: f {:.2} % clock {:.2} ms turn {:.2} deg readout {:.2} ms {:.1?}",
+            e.focal_percent, e.clock_ms, e.rotation_deg, e.readout_ms, e.sigmas
+        );
+        let observable = [
+            found.focal_px.is_observable,
+            found.time_offset_secs.is_observable,
+            found.rotation_is_observable,
+            found.readout_secs.is_observable,
+        ];
+        for (sigmas, is_observable) in e.sigmas.iter().zip(observable) {
+            assert!(!is_observable || *sigmas < 4.0, "{seed}: {:?} {observable:?}", e.sigmas);
+        }
+    }
+}
+
+/// Action cameras: recordings as many as `VIDAR_CALIBRATION_DRAWS` says, a few by default.
+#[test]
+fn a_fisheye_is_told_from_a_pinhole_and_calibrated() {
+    let draws: u64 = std::env::var("VIDAR_CALIBRATION_DRAWS").map_or(4, |d| d.parse().unwrap());
+    let (mut all, mut beyond) = (Vec::new(), 0);
+    for seed in 0..draws {
+        let truth = Handheld::draw_fisheye(seed);
+        let found = calibrate(&truth);
+        let e = errors(&truth, &found);
+        println!(
+            "fisheye {seed}: {:?} f/w {:.2} k1 {:+.3} ({:+.3}) f {:.2} % clock {:.2} ms turn {:.2}° readout {:.2} ms {:.1?}",
+            found.lens,
+            truth.focal / 640.0,
+            truth.radial[0],
+            found.radial[0].value - truth.radial[0],
+            e.focal_percent,
+            e.clock_ms,
+            e.rotation_deg,
+            e.readout_ms,
+            e.sigmas
+        );
+        assert_eq!(found.lens, LensModel::Equidistant, "{seed}");
+        beyond += e.sigmas.iter().filter(|s| **s > 3.0).count();
+        all.push(e);
+    }
+    let of = |value: fn(&Errors) -> f64| median(all.iter().map(value).collect());
+    let medians = [of(|e| e.focal_percent), of(|e| e.clock_ms), of(|e| e.rotation_deg), of(|e| e.readout_ms)];
+    println!("medians {medians:.3?}, {beyond} of {} beyond 3 sigma", 4 * all.len());
+    for (found, goal) in medians.iter().zip([1.5, 3.0, 1.0, 4.0]) {
+        assert!(*found < goal, "median {found} above {goal}");
+    }
+    assert!(50 * beyond <= 4 * all.len(), "{beyond} beyond 3 sigma");
+}
+
+/// Recordings: a few by default, as many as `VIDAR_CALIBRATION_DRAWS` says for the table of docs/benchmark/odometry.md.
+#[test]
+fn twenty_seconds_by_hand_calibrate_camera_and_clock() {
+    let draws: u64 = std::env::var("VIDAR_CALIBRATION_DRAWS").map_or(4, |d| d.parse().unwrap());
+    let first: u64 = std::env::var("VIDAR_CALIBRATION_FIRST").map_or(1000, |d| d.parse().unwrap());
+    let secs: f64 = std::env::var("VIDAR_CALIBRATION_SECS").map_or(20.0, |d| d.parse().unwrap());
+    let mut all = Vec::new();
+    for seed in first..first + draws {
+        let truth = Handheld { secs, ..Handheld::draw(seed) };
+        let begin = std::time::Instant::now();
+        let found = calibrate(&truth);
+        assert_eq!(found.lens, LensModel::RadTan, "{seed}");
+        let e = errors(&truth, &found);
+        println!(
+            "{seed}: f/w {:.2} k1 {:+.2} turn {:.2} move {:.2} px {:.2} ({:.2}) | f {:.2} % k1 {:+.3} k2 {:+.3} clock {:.2} ms turn {:.2}° readout {:.2} ms | sigmas {:.1?} | {:.1} s",
+            truth.focal / 640.0,
+            truth.radial[0],
+            truth.turning,
+            truth.moving,
+            truth.pixel_noise,
+            found.pixel_sigma,
+            e.focal_percent,
+            found.radial[0].value - truth.radial[0],
+            found.radial[1].value - truth.radial[1],
+            e.clock_ms,
+            e.rotation_deg,
+            e.readout_ms,
+            e.sigmas,
+            begin.elapsed().as_secs_f64()
+        );
+        all.push(e);
+    }
+    let of = |value: fn(&Errors) -> f64| median(all.iter().map(value).collect());
+    let medians = [of(|e| e.focal_percent), of(|e| e.clock_ms), of(|e| e.rotation_deg), of(|e| e.readout_ms)];
+    let beyond = all.iter().flat_map(|e| e.sigmas).filter(|s| *s > 3.0).count();
+    println!(
+        "medians: f {:.3} %, clock {:.3} ms, rotation {:.3}°, readout {:.3} ms; {beyond} of {} beyond 3 sigma",
+        medians[0],
+        medians[1],
+        medians[2],
+        medians[3],
+        4 * all.len()
+    );
+    for (found, goal) in medians.iter().zip([1.5, 3.0, 1.0, 4.0]) {
+        assert!(*found < goal, "median {found} above {goal}");
+    }
+    assert!(50 * beyond <= 4 * all.len(), "{beyond} of {} beyond 3 sigma", 4 * all.len());
+}
