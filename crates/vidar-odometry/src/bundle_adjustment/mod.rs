@@ -12,6 +12,8 @@
 
 mod delays;
 mod envelope;
+#[cfg(test)]
+mod example;
 mod findings;
 mod grow;
 mod image_evidence;

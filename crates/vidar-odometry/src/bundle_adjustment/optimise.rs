@@ -283,7 +283,7 @@ pub(super) fn inertial_chi2_per_dof(problem: &Problem) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::image_unknowns::tests::problem;
+    use super::super::example::problem;
     use super::*;
     use std::ops::ControlFlow;
 
