@@ -140,7 +140,8 @@ fn the_odometry_goes_before_the_map(process: u32) {
 #[test]
 fn a_kill_leaves_whole_lines_and_a_resume_goes_on() {
     let out = shared().root.join("live killed");
-    let mut child = mapped("live", &out, &["--realtime"]).spawn().unwrap();
+    // Not at its own rate, at which a busy machine leaves images out, and may never start.
+    let mut child = mapped("live", &out, &[]).spawn().unwrap();
     let (file, clock) = (out.join("trajectory/live.tum"), Instant::now());
     while child.try_wait().unwrap().is_none() && clock.elapsed() < Duration::from_secs(120) {
         if std::fs::read_to_string(&file).is_ok_and(|t| t.lines().count() > 5) {
