@@ -65,14 +65,19 @@ fn run(mode: CouplingMode, seed: u64, drift: f64, false_share: f64) -> Outcome {
         }
     }
     let placement = aligner.finish();
+    let squares = squared_errors(&placement, &truth);
+    Outcome { ate: (squares / placement.views.len() as f64).sqrt(), placement }
+}
+
+/// Sum over the views after the rigid fit, m².
+fn squared_errors(placement: &Placement, truth: &[Se3]) -> f64 {
     let (placed, exact): (Vec<_>, Vec<_>) = placement
         .views
         .iter()
         .map(|v| (v.world_from_camera.translation, truth[v.frame_id.index()].translation))
         .unzip();
     let fit = umeyama_se3(&placed, &exact).unwrap();
-    let squares: f64 = placed.iter().zip(&exact).map(|(p, e)| (fit.act(p) - e).norm_squared()).sum();
-    Outcome { ate: (squares / placed.len() as f64).sqrt(), placement }
+    placed.iter().zip(&exact).map(|(p, e)| (fit.act(p) - e).norm_squared()).sum()
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
@@ -166,13 +171,7 @@ fn old_frames_within_a_chunk_close_the_loop_without_a_loop_chunk() {
             owners.windows(2).all(|o| o[0] <= o[1]),
             "a frame that comes back keeps its owner: {owners:?}"
         );
-        let (placed, exact): (Vec<_>, Vec<_>) = placement
-            .views
-            .iter()
-            .map(|v| (v.world_from_camera.translation, truth[v.frame_id.index()].translation))
-            .unzip();
-        let fit = umeyama_se3(&placed, &exact).unwrap();
-        placed.iter().zip(&exact).map(|(p, e)| (fit.act(p) - e).norm_squared()).sum::<f64>().sqrt()
+        squared_errors(&placement, &truth).sqrt()
     };
     let sum = |takes: bool| (0..4).map(|seed| error(takes, seed)).sum::<f64>();
     let (without, with) = (sum(false), sum(true));
