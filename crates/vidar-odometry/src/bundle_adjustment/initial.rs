@@ -1,8 +1,9 @@
 //! First guess of all states and landmarks from the odometry's log.
 
 use super::inertial::InertialFactor;
+use super::landmark::{Landmark, MIN_INVERSE_DISTANCE};
 use super::log::{TrackKey, TrackLog};
-use super::observation::{self, Landmark, MIN_INVERSE_DISTANCE, SensorCalibration};
+use super::observation::{self, SensorCalibration};
 use super::problem::CalibrationPrior;
 use super::problem::{FrameState, ObservedLandmark, Problem, WhitenedObservation};
 use super::{AdjustmentError, Measurements};

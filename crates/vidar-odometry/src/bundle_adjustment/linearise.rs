@@ -3,7 +3,8 @@
 use super::envelope::Envelope;
 use super::image_unknowns;
 use super::inertial::{GAIN_DIM, InertialJacobians};
-use super::observation::{self, Landmark, Linearised, STATE_DIM};
+use super::landmark::Landmark;
+use super::observation::{self, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
 use super::system::{ByState, LandmarkBlock, System};
 use crate::backend::{GaugePriorSigmas, gauge_prior_at, product};
@@ -267,7 +268,7 @@ fn add_landmark(
         // The floor keeps a landmark whose distance nothing tells where it is.
         own[(k, k)] += damping * own[(k, k)] + 1e-9;
     }
-    block.inverse = own.try_inverse();
+    block.inverse = seen.landmark.inverse_of(&own, &block.gradient);
     let Some(inverse) = block.inverse else { return };
     eliminate(problem, block, &inverse, system);
 }

@@ -7,9 +7,10 @@
 //! other measurements do not contradict them.
 
 use super::AdjustmentError;
+use super::landmark::Landmark;
 use super::linearise::{Cost, cost};
 use super::log::TrackLog;
-use super::observation::{self, Landmark};
+use super::observation;
 use super::optimise::{self, OptimiseReport};
 use super::problem::{Problem, WhitenedObservation};
 use super::progress::Watch;

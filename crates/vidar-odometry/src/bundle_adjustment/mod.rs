@@ -22,6 +22,7 @@ mod image_unknowns;
 mod inertial;
 mod initial;
 mod keyframes;
+mod landmark;
 mod linearise;
 mod log;
 mod loops;

@@ -109,7 +109,7 @@ fn median_distance(problem: &Problem, k: usize) -> Option<f64> {
     let camera =
         problem.frames[k].body.state.world_from_body.act(&problem.calibration.body_from_camera.translation);
     let seen = problem.landmarks.iter().filter(|l| l.observations.iter().any(|o| o.frame == k));
-    let place = |l: &super::observation::Landmark| l.origin + l.direction / l.positive_inverse();
+    let place = |l: &super::landmark::Landmark| l.origin + l.direction / l.positive_inverse();
     median_upper(&mut seen.map(|l| (place(&l.landmark) - camera).norm()).collect::<Vec<f64>>())
 }
 

@@ -8,6 +8,7 @@
 
 use super::image_prior::{IMAGE_DIM, ImagePrior, ImageUnknown};
 use super::inertial::{GAIN_DIM, ImuGain};
+use super::landmark::Landmark;
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, hat};
 use nalgebra::{Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
@@ -35,37 +36,6 @@ pub(super) struct SensorCalibration {
     /// Gains of gyroscope and accelerometer.
     pub(super) gain: ImuGain,
 }
-
-/// A landmark.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Landmark {
-    /// Unit vector, world axes.
-    pub(super) direction: Vector3<f64>,
-    /// 1/m.
-    pub(super) inverse_distance: f64,
-    /// Where direction and distance are counted from, world, m. It is no unknown.
-    pub(super) origin: Vector3<f64>,
-}
-
-impl Landmark {
-    /// The landmark moved by a step: two coordinates of the direction's tangent plane, one of the inverse distance.
-    pub(super) fn plus(&self, step: &Vector3<f64>) -> Self {
-        let direction = crate::backend::bearing_plus(&self.direction, &Vector2::new(step.x, step.y));
-        Self { direction, inverse_distance: (self.inverse_distance + step.z).max(BEYOND_INFINITY), ..*self }
-    }
-
-    /// For who wants a place, 1/m.
-    pub(super) fn positive_inverse(&self) -> f64 {
-        self.inverse_distance.max(MIN_INVERSE_DISTANCE)
-    }
-}
-
-/// Where a landmark has to be somewhere it is 10 km away at most, 1/m.
-pub(super) const MIN_INVERSE_DISTANCE: f64 = 1e-4;
-
-/// The inverse distance of what is far, seen from hardly apart, errs to both sides, and past infinity too. Held there, landmarks do not go along with
-/// the states' step: of a phone that moved by 0.6 m in 23 s a step that promised 26 cost 190 000, and rounds ended by their limit.
-pub(super) const BEYOND_INFINITY: f64 = -0.1;
 
 /// A state with the motion around it.
 #[derive(Clone, Copy, Debug)]

@@ -3,7 +3,8 @@
 use super::envelope::Envelope;
 use super::image_prior::ImagePrior;
 use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
-use super::observation::{Landmark, MovingBody, STATE_DIM, SensorCalibration};
+use super::landmark::Landmark;
+use super::observation::{MovingBody, STATE_DIM, SensorCalibration};
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use nalgebra::{Matrix2, Vector3};
 use vidar_core::{LensMotion, Timestamp, camera::Pixel};

@@ -5,7 +5,7 @@
 //! that only small steps or none were taken along it. Multiplied, it leaves the images as they are. What else a step holds is added, as
 //! before: to first order both are the same.
 
-use super::observation::{BEYOND_INFINITY, Landmark};
+use super::landmark::{BEYOND_INFINITY, Landmark};
 use super::problem::Problem;
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, Vector15};

@@ -5,8 +5,9 @@
 //! minimised alone before the step is judged (embedded point iterations: Jeong, Nistér, Steedly, Szeliski, Kweon 2012, "Pushing the
 //! envelope of modern methods for bundle adjustment").
 
+use super::landmark::Landmark;
 use super::linearise::{KERNEL, landmark_cost};
-use super::observation::{self, Landmark};
+use super::observation;
 use super::problem::{ObservedLandmark, Problem};
 use nalgebra::{Matrix3, Vector3};
 use std::convert::Infallible;
@@ -81,7 +82,7 @@ impl LeastSquares for Alone<'_> {
 
     fn try_step(&mut self, damping: f64) -> Result<Option<(f64, Landmark)>, Infallible> {
         let damped = self.h + Matrix3::from_diagonal(&(self.h.diagonal() * damping).add_scalar(1e-9));
-        Ok(damped.try_inverse().map(|inverse| {
+        Ok(self.landmark.inverse_of(&damped, &self.gradient).map(|inverse| {
             let moved = self.landmark.plus(&-(inverse * self.gradient));
             (landmark_cost(self.problem, self.seen, &moved), moved)
         }))
@@ -171,7 +172,7 @@ mod tests {
         }
         let (landmark, cost) = refined(&problem, &problem.landmarks[0], found_there.plus(&Vector3::z()), 0.0);
         assert!((landmark.inverse_distance + 0.02).abs() < 1e-4 && cost < 1e-3, "{landmark:?} {cost}");
-        assert_eq!(landmark.positive_inverse(), observation::MIN_INVERSE_DISTANCE);
+        assert_eq!(landmark.positive_inverse(), super::super::landmark::MIN_INVERSE_DISTANCE);
     }
 
     #[test]

@@ -16,7 +16,7 @@ pub(super) type ByImage = SMatrix<f64, 3, IMAGE_DIM>;
 /// A landmark's block of the normal equations, kept to find its step from the states'.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LandmarkBlock {
-    /// Inverse of the damped 3 × 3 block; `None` leaves the landmark where it is.
+    /// Inverse of the damped 3 × 3 block, by [`super::landmark::Landmark::inverse_of`]; `None` leaves the landmark where it is.
     pub(super) inverse: Option<Matrix3<f64>>,
     pub(super) gradient: Vector3<f64>,
     /// Of each observation.
@@ -49,9 +49,10 @@ impl System {
 }
 
 impl LandmarkBlock {
-    /// Standard deviation of the inverse distance with the states held, 1/m.
+    /// Standard deviation of the inverse distance with the states held, 1/m; infinite where it is at its bound.
     pub(super) fn inverse_distance_sigma(&self) -> f64 {
-        self.inverse.map_or(f64::INFINITY, |inverse| inverse[(2, 2)].sqrt())
+        let variance = self.inverse.map(|inverse| inverse[(2, 2)]).filter(|variance| *variance > 0.0);
+        variance.map_or(f64::INFINITY, f64::sqrt)
     }
 
     /// The landmark's step that belongs to a step of states and calibration.
