@@ -125,6 +125,7 @@ impl Tracks<'_> {
             prior,
             mount_sigma: mount.map(|_| MOUNT_SIGMA),
             gyro_noise: self.gyro_noise,
+            margin: self.margin(),
         };
         let solution = problem.solve(starts, self.windows)?;
         Some((problem, solution))

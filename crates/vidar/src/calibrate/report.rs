@@ -1,6 +1,6 @@
 //! What was found, in words and as JSON.
 
-use super::yaml::told;
+use super::yaml::{disagreement, told};
 use super::{CalibrateOutcome, Stated, UNKNOWN_LEVER_M};
 use nalgebra::Vector3;
 use serde_json::{Value, json};
@@ -28,10 +28,11 @@ pub(super) fn values(found: &Calibration) -> String {
         false => "rotation against the IMU not observable in this recording".to_owned(),
     };
     format!(
-        "{}, {}, {}, {rotation}, lever arm 0 ± {UNKNOWN_LEVER_M} m",
+        "{}, {}, {}, {rotation}, lever arm 0 ± {UNKNOWN_LEVER_M} m{}",
         told("focal length", &found.focal_px, 1.0, "px", 1),
         told("time offset", &found.time_offset_secs, 1e3, "ms", 1),
         told("readout", &found.readout_secs, 1e3, "ms", 1),
+        disagreement(found).map(|words| format!("; {words}")).unwrap_or_default(),
     )
 }
 
@@ -85,6 +86,7 @@ impl CalibrateOutcome {
             lines.push((axis, value(bias, 1e3, "mrad/s", 2)));
         }
         lines.extend(self.noise_lines());
+        lines.extend(disagreement(c).map(|words| ("doubt", format!("{words}; each σ is as much larger"))));
         for compared in self.comparisons() {
             let verdict = if compared.contradicts() { "contradicts" } else { "agrees" };
             lines.push((
@@ -223,6 +225,7 @@ impl CalibrateOutcome {
             "stated_gyro_noise": self.stated_noise.map(|n| n.gyro_noise_density),
             "stated_accel_noise": self.stated_noise.map(|n| n.accel_noise_density),
             "pixel_sigma": c.pixel_sigma,
+            "gyro_disagreement": c.gyro_disagreement,
             "images": c.images,
             "checks": checks,
             "file": self.file.as_ref().map(|f| f.display().to_string()),

@@ -4,7 +4,7 @@ use super::{CalibrateOutcome, UNKNOWN_LEVER_M, used_readout_ms};
 use crate::imu_noise::believed_noise;
 use std::fmt::Write;
 use vidar_core::LieGroup;
-use vidar_odometry::calibration::Estimate;
+use vidar_odometry::calibration::{Calibration, Estimate};
 
 impl CalibrateOutcome {
     /// The file's text.
@@ -21,6 +21,9 @@ impl CalibrateOutcome {
             let _ = writeln!(out, "{text}");
         };
         line(format!("# Found by `vidar calibrate` from {}: {} images.", self.name, c.images));
+        if let Some(words) = disagreement(c) {
+            line(format!("# Doubt: {words}."));
+        }
         line("cam0:".into());
         line("  camera_model: pinhole".into());
         line(format!("  # {}", told("focal length", &c.focal_px, 1.0, "px", 1)));
@@ -61,6 +64,14 @@ impl CalibrateOutcome {
         line(format!("  update_rate: {:.1}", noise.rate_hz));
         out
     }
+}
+
+/// That images turn otherwise than the gyroscope says, where they do.
+pub(super) fn disagreement(found: &Calibration) -> Option<String> {
+    let times = found.gyro_disagreement;
+    (times > 1.0).then(|| {
+        format!("images turn otherwise than the gyroscope says ({times:.1} times its noise): stabilised, or stamps scatter")
+    })
 }
 
 /// `what value ± sigma unit`, or that the recording does not show it.
