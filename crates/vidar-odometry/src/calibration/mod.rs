@@ -118,7 +118,7 @@ pub struct Calibration {
     pub stretches: usize,
     /// How many times the gyroscope's noise images turn otherwise than it says, as where they are stabilised or stamps scatter; 1 where that is nothing but
     /// noise. Standard deviations are multiplied by it.
-    pub gyro_disagreement: f64,
+    pub gyro_noise_ratio: f64,
 }
 
 /// Feature tracks and gyroscope samples of a recording.
@@ -245,13 +245,13 @@ fn calibration(
     let [formal, spread] = problem.covariances(solution).ok_or(CalibrationFailure::Unexplained)?;
     let x = &solution.parameters;
     let priors = prior_sigmas(x.lens, width);
-    let gyro_disagreement = solution.gyro_disagreement();
-    let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / stretches as f64) * gyro_disagreement;
+    let gyro_noise_ratio = solution.gyro_noise_ratio();
+    let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / stretches as f64) * gyro_noise_ratio;
     let sigma = |p: usize| {
         let floor = match p {
             FOCAL => FOCAL_FLOOR,
             READOUT => READOUT_SHARE * x.readout_secs,
-            OFFSET if gyro_disagreement > 1.0 => LAG_SECS,
+            OFFSET if gyro_noise_ratio > 1.0 => LAG_SECS,
             _ if (CENTRE..CENTRE + 2).contains(&p) => CENTRE_FLOOR * width,
             _ if (ROTATION..ROTATION + 3).contains(&p) => ROTATION_FLOOR,
             _ => 0.0,
@@ -281,6 +281,6 @@ fn calibration(
         pixel_sigma: solution.noise.pixel,
         images: tracks.images.len(),
         stretches,
-        gyro_disagreement,
+        gyro_noise_ratio,
     })
 }

@@ -92,20 +92,13 @@ impl Problem<'_> {
 
     /// How far those that explain the recording as well as the first one lie from it (root mean square).
     fn spread(&self, solutions: &[Solution]) -> Tangent {
-        let mut sum = Tangent::zeros();
-        let mut as_good = 0.0;
-        for other in solutions {
-            let best = &solutions[0];
-            if other.score() - best.score() > self.margin {
-                continue;
-            }
-            let mut apart = other.parameters.minus(&best.parameters);
-            let turn = best.parameters.body_from_camera.inverse() * other.parameters.body_from_camera;
-            apart.fixed_rows_mut::<3>(ROTATION).copy_from(&turn.log());
-            sum += apart.component_mul(&apart);
-            as_good += 1.0;
-        }
-        sum.map(|square: f64| (square / f64::max(as_good, 1.0)).sqrt())
+        let Some(best) = solutions.first() else { return Tangent::zeros() };
+        let as_good = solutions.iter().take_while(|other| other.score() - best.score() <= self.margin);
+        let (sum, count) = as_good.fold((Tangent::zeros(), 0), |(sum, count), other| {
+            let apart = difference(&other.parameters, &best.parameters);
+            (sum + apart.component_mul(&apart), count + 1)
+        });
+        sum.map(|square: f64| (square / f64::from(count.max(1))).sqrt())
     }
 
     /// Levenberg-Marquardt with the pixel noise estimated anew from the residuals in each round.
@@ -144,12 +137,10 @@ impl Problem<'_> {
     }
 
     fn off_prior(&self, parameters: &Parameters) -> Tangent {
-        let mut off = parameters.minus(&self.prior);
-        if self.mount_sigma.is_some() {
-            let turn = self.prior.body_from_camera.inverse() * parameters.body_from_camera;
-            off.fixed_rows_mut::<3>(ROTATION).copy_from(&turn.log());
+        match self.mount_sigma {
+            Some(_) => difference(parameters, &self.prior),
+            None => parameters.minus(&self.prior),
         }
-        off
     }
 
     fn cost(&self, parameters: &Parameters, windows: &[Window], noise: &Noise) -> f64 {
@@ -242,7 +233,7 @@ impl LeastSquares for Refinement<'_> {
 
 impl Solution {
     /// How many times the gyroscope's noise images turn otherwise than it says; 1 where that is nothing but noise.
-    pub fn gyro_disagreement(&self) -> f64 {
+    pub fn gyro_noise_ratio(&self) -> f64 {
         let pairs = self.windows.iter().flat_map(|window| window.nodes.windows(2));
         let squares = pairs.map(|pair| {
             let secs = (pair[1].secs - pair[0].secs).max(1e-3);
@@ -260,6 +251,14 @@ impl Solution {
             self.windows.iter().flat_map(|w| &w.points).map(|p| p.observations.len()).sum();
         self.cost + 2.0 * observations as f64 * self.noise.pixel.ln()
     }
+}
+
+/// `a − b` as a tangent, the rotation included.
+fn difference(a: &Parameters, b: &Parameters) -> Tangent {
+    let mut apart = a.minus(b);
+    let turn = b.body_from_camera.inverse() * a.body_from_camera;
+    apart.fixed_rows_mut::<3>(ROTATION).copy_from(&turn.log());
+    apart
 }
 
 /// The best first.

@@ -225,7 +225,7 @@ impl CalibrateOutcome {
             "stated_gyro_noise": self.stated_noise.map(|n| n.gyro_noise_density),
             "stated_accel_noise": self.stated_noise.map(|n| n.accel_noise_density),
             "pixel_sigma": c.pixel_sigma,
-            "gyro_disagreement": c.gyro_disagreement,
+            "gyro_noise_ratio": c.gyro_noise_ratio,
             "images": c.images,
             "checks": checks,
             "file": self.file.as_ref().map(|f| f.display().to_string()),

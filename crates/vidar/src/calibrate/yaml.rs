@@ -68,9 +68,9 @@ impl CalibrateOutcome {
 
 /// That images turn otherwise than the gyroscope says, where they do.
 pub(super) fn disagreement(found: &Calibration) -> Option<String> {
-    let times = found.gyro_disagreement;
+    let times = found.gyro_noise_ratio;
     (times > 1.0).then(|| {
-        format!("images turn otherwise than the gyroscope says ({times:.1} times its noise): stabilised, or stamps scatter")
+        format!("images turn otherwise than the gyroscope says ({times:.1} times its noise), as where they are stabilised or stamps scatter")
     })
 }
 
