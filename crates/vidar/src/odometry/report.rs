@@ -4,6 +4,7 @@ use super::OdometryOutcome;
 use crate::error::Error;
 use crate::run_folder::RunFolder;
 use vidar_core::{StampedPose, Trajectory};
+use vidar_eval::{TrajectoryReport, TransformRecord};
 use vidar_odometry::Tracking;
 use vidar_view::{
     AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory, Report, Section, Series,
@@ -33,8 +34,7 @@ pub(super) fn write(
     let mut path = Section { heading: "Path".into(), ..Section::default() };
     if let Some(trajectory) = &outcome.trajectory {
         let picture = path_picture(outcome, trajectory, truth);
-        let caption =
-            "Path of the body from above and from the side, aligned with ground truth where there is one";
+        let caption = "Path of the body from above and from the side: as it was estimated live and as adjusted after the end, each aligned with ground truth where there is one";
         path.figures.push(figure("odometry_path", picture, caption, FigureWidth::Full)?);
     }
     path.paragraphs.extend(outcome.tracked.lost.iter().map(|l| {
@@ -77,21 +77,37 @@ fn path_picture(
 ) -> vidar_view::Picture {
     let plot = TrajectoryPlot { up: nalgebra::Vector3::z(), ..TrajectoryPlot::default() };
     let size = PictureSize::new(PATH_SIZE.0, PATH_SIZE.1);
-    let record = outcome.report.as_ref().and_then(|r| match outcome.scale.is_metric {
-        true => r.truth_from_estimate_se3,
-        false => r.truth_from_estimate_sim3,
-    });
-    let aligned = record.and_then(|r| moved(trajectory, &r));
-    let mut shown = vec![PlotTrajectory::estimate("odometry", aligned.as_ref().unwrap_or(trajectory))];
-    if let (Some(truth), true) = (truth, aligned.is_some()) {
+    let last = outcome.final_trajectory.as_ref();
+    let estimates: Vec<_> =
+        [("live", Some(trajectory), &outcome.report), ("final", last, &outcome.final_report)]
+            .into_iter()
+            .filter_map(|(label, trajectory, report)| Some((label, trajectory?, alignment(report, outcome))))
+            .map(|(label, trajectory, alignment)| {
+                let aligned = alignment.and_then(|a| moved(trajectory, &a));
+                (label, aligned.is_some(), aligned.unwrap_or_else(|| trajectory.clone()))
+            })
+            .collect();
+    let mut shown: Vec<_> =
+        estimates.iter().map(|(label, _, t)| PlotTrajectory::estimate(label, t)).collect();
+    // What is not aligned is in another frame than ground truth.
+    if let (Some(truth), true) = (truth, estimates.iter().all(|(_, is_aligned, _)| *is_aligned)) {
         shown.push(PlotTrajectory::ground_truth("ground truth", truth));
     }
     vidar_view::plot_trajectories(&shown, &plot, size)
 }
 
+/// What places an estimate on ground truth: with its own scale where that is metric.
+fn alignment(report: &Option<TrajectoryReport>, outcome: &OdometryOutcome) -> Option<TransformRecord> {
+    let report = report.as_ref()?;
+    match outcome.scale.is_metric {
+        true => report.truth_from_estimate_se3,
+        false => report.truth_from_estimate_sim3,
+    }
+}
+
 /// The trajectory as `record` places it.
-fn moved(trajectory: &Trajectory, record: &vidar_eval::TransformRecord) -> Option<Trajectory> {
-    let rigid = vidar_eval::TransformRecord { scale: 1.0, ..*record }.to_se3()?;
+fn moved(trajectory: &Trajectory, record: &TransformRecord) -> Option<Trajectory> {
+    let rigid = TransformRecord { scale: 1.0, ..*record }.to_se3()?;
     let poses = trajectory.poses().iter().map(|p| {
         let mut world_from_body = p.world_from_body;
         world_from_body.translation *= record.scale;
