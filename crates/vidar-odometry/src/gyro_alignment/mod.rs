@@ -81,6 +81,11 @@ impl GyroAlignmentLog {
         }
     }
 
+    /// The last image of the newest problem.
+    pub fn last_attempt(&self) -> Option<Timestamp> {
+        self.last_attempt
+    }
+
     /// Forgets features: they show no point of the world.
     pub fn leave_out(&mut self, features: &[LandmarkId]) {
         for (_, seen) in self.images.iter_mut().filter(|_| !features.is_empty()) {

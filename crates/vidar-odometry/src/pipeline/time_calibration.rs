@@ -22,6 +22,9 @@ const USABLE_OFFSET_SECS: f64 = 0.004;
 const SETTLED_OFFSET_SECS: f64 = 0.0015;
 const SETTLED_READOUT_SECS: f64 = 0.003;
 
+/// Solutions this far apart in time, s, share half of their images at most: what they differ by beyond their standard deviations was not in these.
+const APART_SECS: f64 = 2.5;
+
 /// Largest mean squared whitened residual of a solution that explains the tracks.
 const MAX_CHI2_PER_DOF: f64 = 3.0;
 
@@ -86,6 +89,8 @@ pub(crate) struct TimeCalibration {
     estimated: Option<(f64, f64)>,
     attempts: usize,
     is_settled: bool,
+    /// What attempts found so far, by the time of the last image.
+    earlier: Vec<(Timestamp, Alignment)>,
     /// The attempt that is being solved, and whether from a short stretch.
     solving: Option<(Deferred<Option<Alignment>>, bool)>,
 }
@@ -104,6 +109,7 @@ impl TimeCalibration {
             estimated: None,
             attempts: 0,
             is_settled: !config.align_timing || (!estimates_offset && readout_secs.is_some()),
+            earlier: Vec::new(),
             solving: None,
         }
     }
@@ -152,6 +158,7 @@ impl TimeCalibration {
     /// Forgets all measurements: a saturated gyroscope integrates to a wrong rotation.
     pub fn forget(&mut self) {
         self.log = GyroAlignmentLog::default();
+        self.earlier.clear();
         self.solving = None;
     }
 
@@ -171,6 +178,7 @@ impl TimeCalibration {
         // A state is not given up for what half the images say: on a slow hand that was twice as far off.
         let due = due.filter(|(_, is_short)| !(*is_short && is_tracking));
         if let Some(found) = due.and_then(|(solving, _)| solving.result()).flatten() {
+            let found = self.doubted(found);
             return self.take(&found, camera, offset_secs, is_tracking);
         }
         if let (None, Some(now)) = (&self.solving, now) {
@@ -195,6 +203,21 @@ impl TimeCalibration {
             let due = now + Duration::from_secs_f64(secs);
             let is_short = problem.is_short();
             self.solving = Some((Deferred::begin(due, move || problem.solve()), is_short));
+        }
+    }
+
+    /// A solution whose standard deviations are widened by how far solutions of other images are from it (the median, since one may have
+    /// missed the clock's basin); it is kept, too.
+    fn doubted(&mut self, found: Alignment) -> Alignment {
+        let Some(now) = self.log.last_attempt() else { return found };
+        let apart = |(time, _): &&(Timestamp, Alignment)| (now - *time).as_secs_f64() >= APART_SECS;
+        let others: Vec<Alignment> = self.earlier.iter().filter(apart).map(|(_, a)| *a).collect();
+        self.earlier.push((now, found));
+        Alignment {
+            offset_sigma: found.offset_sigma * excess(&found, &others, |a| (a.offset_secs, a.offset_sigma)),
+            readout_sigma: found.readout_sigma
+                * excess(&found, &others, |a| (a.readout_secs, a.readout_sigma)),
+            ..found
         }
     }
 
@@ -266,9 +289,42 @@ impl TimeCalibration {
     }
 }
 
+/// Median distance of `others` from a solution over the standard deviation of their difference, at least 1.
+fn excess(found: &Alignment, others: &[Alignment], value: fn(&Alignment) -> (f64, f64)) -> f64 {
+    let (at, sigma) = value(found);
+    let mut distances: Vec<f64> =
+        others.iter().map(value).map(|(x, s)| (x - at).abs() / sigma.hypot(s)).collect();
+    distances.sort_unstable_by(f64::total_cmp);
+    distances.get(distances.len() / 2).map_or(1.0, |d| d.max(1.0))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn alignment(offset_ms: f64, sigma_ms: f64) -> Alignment {
+        Alignment {
+            offset_secs: 1e-3 * offset_ms,
+            readout_secs: 0.0,
+            body_from_camera: So3::IDENTITY,
+            offset_sigma: 1e-3 * sigma_ms,
+            readout_sigma: 1e-3,
+            rotation_sigma: 0.01,
+            chi2_per_dof: 1.0,
+        }
+    }
+
+    #[test]
+    fn clocks_that_contradict_each_other_are_known_less_well_and_one_outlier_is_not_heard() {
+        let clock = |a: &Alignment| (a.offset_secs, a.offset_sigma);
+        let agree = [alignment(10.0, 1.0), alignment(11.0, 1.0), alignment(60.0, 1.0)];
+        assert_eq!(excess(&alignment(10.5, 1.0), &agree, clock), 1.0);
+        // As a slow circle was: 4 ms each, and 40 ms apart.
+        let differ = [alignment(-107.0, 7.0), alignment(-40.0, 7.0), alignment(-37.0, 7.0)];
+        let factor = excess(&alignment(-83.0, 4.0), &differ, clock);
+        assert!((43.0 / 7.0_f64.hypot(4.0) - factor).abs() < 1e-9, "{factor}");
+        assert_eq!(excess(&alignment(0.0, 1.0), &[], clock), 1.0);
+    }
 
     #[test]
     fn what_is_known_or_was_looked_for_is_not_looked_for_again() {
