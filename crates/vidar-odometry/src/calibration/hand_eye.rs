@@ -32,6 +32,8 @@ pub(super) struct Start {
     pub parameters: Parameters,
     /// Share of the images' rotation that it leaves unexplained.
     pub unexplained: f64,
+    /// Whether another clock leaves less with the same focal length.
+    pub is_another_clock: bool,
 }
 
 /// Starts with a kind of lens in the order of what they leave unexplained: the best clock offset of every trial focal length, and others
@@ -69,7 +71,7 @@ pub(super) fn starts(
                     None => best_rotation(&rates)?,
                 };
                 let parameters = Parameters { offset_secs, body_from_camera, bias, ..parameters };
-                Some(Start { parameters, unexplained })
+                Some(Start { parameters, unexplained, is_another_clock: false })
             })
             .collect();
         offsets.sort_by(|a, b| a.unexplained.total_cmp(&b.unexplained));
@@ -79,11 +81,25 @@ pub(super) fn starts(
             let taken = &found[first..];
             let is_good = taken.first().is_none_or(|best| start.unexplained < NEARLY * best.unexplained);
             if is_good && taken.iter().all(|s| (s.parameters.offset_secs - clock).abs() > BASIN_SECS) {
-                found.push(start);
+                found.push(Start { is_another_clock: !taken.is_empty(), ..start });
             }
         }
     }
-    found.sort_by(|a, b| a.unexplained.total_cmp(&b.unexplained));
+    // Turning nearly about one axis shows a mount with long focal lengths only, for which images seem to turn more about the others. Short ones are tried with it, too.
+    let without = |focal: f64| found.iter().all(|s| s.parameters.focal != focal);
+    let best = found.iter().min_by(|a, b| a.unexplained.total_cmp(&b.unexplained)).copied();
+    let focals = lens.trial_focals().iter().map(|widths| widths * size.0).filter(|f| without(*f));
+    let more: Vec<Start> = focals
+        .zip(std::iter::repeat(best))
+        .filter_map(|(focal, best)| {
+            best.map(|best| Start { parameters: Parameters { focal, ..best.parameters }, ..best })
+        })
+        .collect();
+    found.extend(more);
+    // The best of each focal length first: where a hand moves more than it turns, long ones seem to explain more, and with every clock.
+    found.sort_by(|a, b| {
+        a.is_another_clock.cmp(&b.is_another_clock).then(a.unexplained.total_cmp(&b.unexplained))
+    });
     found
 }
 
@@ -215,5 +231,20 @@ mod tests {
             };
             assert!((1..swept.len()).all(|k| swept[..k].iter().all(|s| is_apart(s, &swept[k]))), "{seed}");
         }
+    }
+
+    /// Turning nearly about one axis shows the mount with some focal lengths only; all are tried.
+    #[test]
+    fn every_focal_length_is_a_start_where_some_show_the_mount() {
+        let mut partly = 0;
+        for seed in 0..8 {
+            let motion = Handheld { main_axis: (1, 0.1), turning: 0.3, moving: 0.3, ..Handheld::draw(seed) };
+            let starts = starts_of(&motion);
+            let best: Vec<&Start> = starts.iter().filter(|s| !s.is_another_clock).collect();
+            assert!(best.is_empty() || best.len() == LensModel::RadTan.trial_focals().len(), "{seed}");
+            let own = best.iter().filter(|s| s.unexplained != best[0].unexplained).count();
+            partly += usize::from(own + 1 < best.len());
+        }
+        assert!(partly > 0, "no seed tries it");
     }
 }

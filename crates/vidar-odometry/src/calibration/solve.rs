@@ -34,7 +34,7 @@ const SCHEDULE: Schedule = Schedule {
 };
 
 /// Starts that are refined on few stretches, and clocks of them on all.
-const MAX_STARTS: usize = 12;
+const MAX_STARTS: usize = 18;
 const MAX_CLOCKS: usize = 5;
 
 /// Standard deviation of a measured pixel: bounds of what the residuals say, pixels. Below, rounding of grey levels and
