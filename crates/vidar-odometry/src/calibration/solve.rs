@@ -11,8 +11,9 @@ use vidar_core::LieGroup;
 use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
 use vidar_solve::statistics::{STD_PER_MAD, median};
 
-/// Rounds of scale estimation.
+/// Rounds of scale estimation, and how many there may be of all stretches while the score still falls.
 const ROUNDS: usize = 5;
+const MAX_ROUNDS: usize = 20;
 /// In so many of them, the first, the clock stays where it starts: while positions and points are far off, it went astray by 150 ms.
 const CLOCK_HELD: usize = 3;
 /// What its information is multiplied by meanwhile.
@@ -24,6 +25,9 @@ const FINE: Limits = Limits { trials: 24, ..Limits::NONE };
 /// Largest mean squared change of the gyroscope's drift, in units of its noise, where images turn as the gyroscope says. Rendered recordings by twelve
 /// devices: 0.04 to 1.1 where they do, 1.6 to 9 of four stabilised ones, 2.1 of one whose stamps scatter.
 const MAX_DRIFT_CHI2: f64 = 1.3;
+
+/// Share of the margin within which solutions explain a recording equally well: a round that gains less ends them.
+const SETTLED: f64 = 0.05;
 
 const SCHEDULE: Schedule = Schedule {
     first: 1e-3,
@@ -112,7 +116,8 @@ impl Problem<'_> {
             Solution { parameters: *start, windows, cost: f64::INFINITY, noise, spread: Tangent::zeros() };
         let mut refinement = Refinement { problem: self, at, is_clock_held: true };
         let mut schedule = SCHEDULE;
-        for round in 0..ROUNDS {
+        let mut score = f64::INFINITY;
+        for round in 0..MAX_ROUNDS {
             refinement.is_clock_held = round < CLOCK_HELD;
             let at = &mut refinement.at;
             let path = self.path(&at.parameters);
@@ -124,6 +129,11 @@ impl Problem<'_> {
             let cost = at.cost;
             let Ok(report) = minimise(&mut refinement, cost, &schedule, &limits);
             schedule.first = report.damping;
+            let before = std::mem::replace(&mut score, refinement.at.score());
+            let has_settled = limits == COARSE || before - score < SETTLED * self.margin;
+            if round + 1 >= ROUNDS && has_settled {
+                break;
+            }
         }
         Some(refinement.at)
     }
