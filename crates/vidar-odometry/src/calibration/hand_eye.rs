@@ -85,17 +85,18 @@ pub(super) fn starts(
             }
         }
     }
-    // Turning nearly about one axis shows a mount with long focal lengths only, for which images seem to turn more about the others. Short ones are tried with it, too.
-    let without = |focal: f64| found.iter().all(|s| s.parameters.focal != focal);
-    let best = found.iter().min_by(|a, b| a.unexplained.total_cmp(&b.unexplained)).copied();
-    let focals = lens.trial_focals().iter().map(|widths| widths * size.0).filter(|f| without(*f));
-    let more: Vec<Start> = focals
-        .zip(std::iter::repeat(best))
-        .filter_map(|(focal, best)| {
-            best.map(|best| Start { parameters: Parameters { focal, ..best.parameters }, ..best })
-        })
-        .collect();
-    found.extend(more);
+    // Turning nearly about one axis shows a mount with long focal lengths only, with which images seem to turn more about the others: short ones are
+    // tried with it, too.
+    let focals = lens.trial_focals().iter().map(|widths| widths * size.0);
+    let missing: Vec<f64> =
+        focals.filter(|focal| found.iter().all(|s| s.parameters.focal != *focal)).collect();
+    if let Some(best) = found.iter().min_by(|a, b| a.unexplained.total_cmp(&b.unexplained)).copied() {
+        found.extend(
+            missing
+                .into_iter()
+                .map(|focal| Start { parameters: Parameters { focal, ..best.parameters }, ..best }),
+        );
+    }
     // The best of each focal length first: where a hand moves more than it turns, long ones seem to explain more, and with every clock.
     found.sort_by(|a, b| {
         a.is_another_clock.cmp(&b.is_another_clock).then(a.unexplained.total_cmp(&b.unexplained))

@@ -208,12 +208,14 @@ impl TimeCalibration {
     }
 
     /// A solution whose standard deviations are widened by how far solutions of other images are from it (the median, since one may have
-    /// missed the clock's basin); it is kept, too.
+    /// missed the clock's basin). Where it explains its images it is compared with later ones, too.
     fn doubted(&mut self, found: Alignment) -> Alignment {
         let Some(now) = self.log.last_attempt() else { return found };
         let apart = |(time, _): &&(Timestamp, Alignment)| (now - *time).as_secs_f64() >= APART_SECS;
         let others: Vec<Alignment> = self.earlier.iter().filter(apart).map(|(_, a)| *a).collect();
-        self.earlier.push((now, found));
+        if found.chi2_per_dof < MAX_CHI2_PER_DOF {
+            self.earlier.push((now, found));
+        }
         Alignment {
             offset_sigma: found.offset_sigma * excess(&found, &others, |a| (a.offset_secs, a.offset_sigma)),
             readout_sigma: found.readout_sigma
@@ -287,10 +289,11 @@ impl TimeCalibration {
 }
 
 /// The readout found where a rolling shutter of any readout up to [`MAX_READOUT_SECS`] explains it better than a global one, else 0: the Bayes
-/// factor of the two, which asks for 1.2 standard deviations where they are 9 ms and for 2.3 where they are 1.5 ms.
+/// factor of the two, which asks for 1.2 standard deviations where they are 9 ms and for 2.3 where they are 1.5 ms, and for one at least.
 fn likelier_readout(found_secs: f64, sigma: f64) -> f64 {
     let occam = MAX_READOUT_SECS / (sigma * std::f64::consts::TAU.sqrt());
-    let is_rolling = found_secs > MIN_READOUT_SECS && (found_secs / sigma).powi(2) > 2.0 * occam.ln();
+    let is_rolling =
+        found_secs > MIN_READOUT_SECS && (found_secs / sigma).powi(2) > (2.0 * occam.ln()).max(1.0);
     if is_rolling { found_secs.min(MAX_READOUT_SECS) } else { 0.0 }
 }
 
@@ -335,6 +338,7 @@ mod tests {
     fn a_readout_that_is_likelier_than_none_is_used_though_it_is_not_known_well() {
         assert_eq!(likelier_readout(0.026, 0.009), 0.026);
         assert_eq!(likelier_readout(0.009, 0.009), 0.0);
+        assert_eq!(likelier_readout(0.025, 0.03), 0.0);
         assert_eq!(likelier_readout(0.006, 0.003), 0.006);
         assert_eq!(likelier_readout(0.0055, 0.003), 0.0);
         assert_eq!(likelier_readout(0.0035, 0.0005), 0.0, "too little to matter");
