@@ -11,17 +11,16 @@ use vidar_core::LieGroup;
 use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
 use vidar_solve::statistics::{STD_PER_MAD, median};
 
-/// Rounds of scale estimation, and how many there may be of all stretches while the score still falls.
+/// Rounds of scale estimation, which go on beyond these while the score falls, where there may be more.
 const ROUNDS: usize = 5;
-const MAX_ROUNDS: usize = 20;
 /// In so many of them, the first, the clock stays where it starts: while positions and points are far off, it went astray by 150 ms.
 const CLOCK_HELD: usize = 3;
 /// What its information is multiplied by meanwhile.
 const HELD: f64 = 1e9;
-/// Steps that are tried in each, of few stretches and of all. The way to the focal length is long and flat where the body turns about one axis (a
+/// What is spent on few stretches and on all. The way to the focal length is long and flat where the body turns about one axis (a
 /// GoPro's walk: 336 ± 25 px with six, 374 ± 1 with these), and so is that to the clock where it goes round a room.
-const COARSE: Limits = Limits { trials: 4, ..Limits::NONE };
-const FINE: Limits = Limits { trials: 24, ..Limits::NONE };
+const COARSE: Effort = Effort { rounds: ROUNDS, trials: 4 };
+const FINE: Effort = Effort { rounds: 20, trials: 24 };
 /// Largest mean squared change of the gyroscope's drift, in units of its noise, where images turn as the gyroscope says. Rendered recordings by twelve
 /// devices: 0.04 to 1.1 where they do, 1.6 to 9 of four stabilised ones, 2.1 of one whose stamps scatter.
 const MAX_DRIFT_CHI2: f64 = 1.3;
@@ -44,6 +43,13 @@ const MAX_CLOCKS: usize = 5;
 /// Standard deviation of a measured pixel: bounds of what the residuals say, pixels. Below, rounding of grey levels and
 /// the patch model err; above, the model does not fit.
 const PIXEL_SIGMA: (f64, f64) = (0.1, 12.0);
+
+/// Most rounds of a refinement, and steps that are tried in each.
+#[derive(Clone, Copy)]
+struct Effort {
+    rounds: usize,
+    trials: usize,
+}
 
 /// Samples, stretches and what is believed of them.
 pub(super) struct Problem<'a> {
@@ -106,7 +112,7 @@ impl Problem<'_> {
     }
 
     /// Levenberg-Marquardt with the pixel noise estimated anew from the residuals in each round.
-    fn refine(&self, start: &Parameters, windows: &[Window], limits: Limits) -> Option<Solution> {
+    fn refine(&self, start: &Parameters, windows: &[Window], effort: Effort) -> Option<Solution> {
         let mut windows = windows.to_vec();
         for window in &mut windows {
             window.restart(start, &self.path(start));
@@ -116,8 +122,9 @@ impl Problem<'_> {
             Solution { parameters: *start, windows, cost: f64::INFINITY, noise, spread: Tangent::zeros() };
         let mut refinement = Refinement { problem: self, at, is_clock_held: true };
         let mut schedule = SCHEDULE;
+        let limits = Limits { trials: effort.trials, ..Limits::NONE };
         let mut score = f64::INFINITY;
-        for round in 0..MAX_ROUNDS {
+        for round in 0..effort.rounds {
             refinement.is_clock_held = round < CLOCK_HELD;
             let at = &mut refinement.at;
             let path = self.path(&at.parameters);
@@ -130,8 +137,7 @@ impl Problem<'_> {
             let Ok(report) = minimise(&mut refinement, cost, &schedule, &limits);
             schedule.first = report.damping;
             let before = std::mem::replace(&mut score, refinement.at.score());
-            let has_settled = limits == COARSE || before - score < SETTLED * self.margin;
-            if round + 1 >= ROUNDS && has_settled {
+            if round + 1 >= ROUNDS && before - score < SETTLED * self.margin {
                 break;
             }
         }

@@ -5,6 +5,7 @@ use crate::config::OdometryConfig;
 use crate::deferred::Deferred;
 use crate::gyro_alignment::{Alignment, Guess, GyroAlignmentLog};
 use vidar_core::{Duration, ImuSample, LandmarkId, LieGroup, RigCamera, Se3, So3, Timestamp, camera::Pixel};
+use vidar_solve::statistics::median_upper;
 
 /// Differences from the values in use below which nothing is corrected, besides three standard deviations: the backend
 /// estimates a clock offset of some milliseconds by itself, and a readout of 4 ms moves a pixel by less than one at 1 rad/s.
@@ -302,8 +303,7 @@ fn excess(found: &Alignment, others: &[Alignment], value: fn(&Alignment) -> (f64
     let (at, sigma) = value(found);
     let mut distances: Vec<f64> =
         others.iter().map(value).map(|(x, s)| (x - at).abs() / sigma.hypot(s)).collect();
-    distances.sort_unstable_by(f64::total_cmp);
-    distances.get(distances.len() / 2).map_or(1.0, |d| d.max(1.0))
+    median_upper(&mut distances).map_or(1.0, |d| d.max(1.0))
 }
 
 #[cfg(test)]

@@ -81,10 +81,10 @@ fn path_picture(
     let estimates: Vec<_> =
         [("live", Some(trajectory), &outcome.report), ("final", last, &outcome.final_report)]
             .into_iter()
-            .filter_map(|(label, trajectory, report)| Some((label, trajectory?, alignment(report, outcome))))
-            .map(|(label, trajectory, alignment)| {
-                let aligned = alignment.and_then(|a| moved(trajectory, &a));
-                (label, aligned.is_some(), aligned.unwrap_or_else(|| trajectory.clone()))
+            .filter_map(|(label, trajectory, report)| {
+                let trajectory = trajectory?;
+                let aligned = alignment(report, outcome).and_then(|a| moved(trajectory, &a));
+                Some((label, aligned.is_some(), aligned.unwrap_or_else(|| trajectory.clone())))
             })
             .collect();
     let mut shown: Vec<_> =
