@@ -19,7 +19,7 @@ use vidar_core::{
 use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::OdometryConfig;
 use vidar_odometry::calibration::{
-    Calibration, CalibrationFailure, CalibrationLog, FeatureTracker, SensorNoise, sensor_noise,
+    Calibration, CalibrationFailure, CalibrationLog, FeatureTracker, KnownCamera, SensorNoise, sensor_noise,
 };
 
 /// The stage's name in events.
@@ -30,7 +30,7 @@ pub const UNKNOWN_LEVER_M: f64 = 0.05;
 
 /// Clock offsets that are known better than this are kept by the odometry, s: a rendered slow phone, found within 0.1 ms,
 /// was lost when the odometry corrected it by 10 ms from a few seconds.
-const SETTLED_OFFSET_SECS: f64 = 0.0015;
+pub(crate) const SETTLED_OFFSET_SECS: f64 = 0.0015;
 /// Largest relative σ of the focal length and σ of the clock offset of a calibration that is used without being asked for. Eleven
 /// rendered recordings of 20 s had 0.3 to 0.5 % and 0.1 to 0.7 ms. The odometry looks for the clock itself within 150 ms; one that went round a room had 62.
 const MAX_FOCAL_SIGMA: f64 = 0.04;
@@ -101,7 +101,9 @@ pub fn calibrate(
     cancel: &CancelToken,
 ) -> Result<CalibrateOutcome, Error> {
     let dataset = events.stage("read", 0, || vidar_dataset::open(&request.path, &request.open))?;
-    let calibration = events.stage(STAGE, 0, || look(&dataset, events, cancel))?;
+    let mount = assumed_mount(&dataset);
+    let known = KnownCamera { assumed_mount: mount.as_ref(), ..KnownCamera::default() };
+    let calibration = events.stage(STAGE, 0, || look(&dataset, &known, events, cancel))?;
     let camera = dataset.rig.camera(dataset.camera);
     let is_stated = dataset.calibration != CalibrationSource::Guessed;
     let stated = camera.filter(|_| is_stated).map(|c| Stated {
@@ -150,15 +152,15 @@ pub(crate) fn has_no_mount(dataset: &Recording) -> bool {
 
 /// Whether a lens is given by its focal length and principal point alone: nobody measured it.
 pub(crate) fn is_plain(dataset: &Recording) -> bool {
-    dataset.rig.camera(dataset.camera).is_some_and(|camera| match &camera.model {
-        CameraModel::Pinhole(_) => true,
-        model @ CameraModel::RadTan(_) => model.parameters().iter().skip(4).all(|k| *k == 0.0),
-        _ => false,
-    })
+    dataset.rig.camera(dataset.camera).is_some_and(|camera| camera.model.is_undistorted())
 }
 
-/// Whether the recording contradicts a lens without distortion: by its focal length or by the distortion that it shows.
-fn contradicts(found: &Calibration, given: &CameraModel) -> bool {
+/// Whether what is found of the lens takes the place of a given one without distortion, which the recording contradicts: by its focal length or by the
+/// distortion that it shows.
+fn replaces(found: &Calibration, given: &CameraModel) -> bool {
+    if vague_focal(found).is_some() {
+        return false;
+    }
     let focal = found.focal_px;
     let is_other = |shown: f64, sigma: f64| shown.abs() > CONTRADICTING_SIGMAS * sigma;
     is_other(focal.value - given.intrinsics().fx, focal.sigma)
@@ -191,7 +193,7 @@ pub(crate) fn complete(
 ) -> Result<(), Error> {
     let Some(missing) = MissingCalibration::of(dataset) else { return Ok(()) };
     let has_lens = missing == MissingCalibration::Mount;
-    let found = match events.stage(STAGE, 0, || look(dataset, events, cancel)) {
+    let found = match look_for(missing, dataset, events, cancel) {
         Err(Error::NotCalibrated { .. }) if has_lens => return Ok(()),
         found => found?,
     };
@@ -207,9 +209,7 @@ pub(crate) fn complete(
     let model = model_of(&found, size)?;
     let is_lens_plain = is_plain(dataset);
     let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(()) };
-    // What is found of the lens may be vague where one is given.
-    let is_lens_known = vague_focal(&found).is_none();
-    if !has_lens || is_lens_known && is_lens_plain && contradicts(&found, &camera.model) {
+    if !has_lens || is_lens_plain && replaces(&found, &camera.model) {
         camera.model = model;
     }
     camera.body_from_camera = Se3::new(found.body_from_camera, nalgebra::Vector3::zeros());
@@ -239,8 +239,9 @@ pub(crate) fn found_in_words(
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<String, String> {
-    let found = events.stage(STAGE, 0, || look(dataset, events, cancel)).map_err(|e| e.to_string())?;
-    let has_lens = MissingCalibration::of(dataset) == Some(MissingCalibration::Mount);
+    let missing = MissingCalibration::of(dataset).unwrap_or(MissingCalibration::Camera);
+    let found = look_for(missing, dataset, events, cancel).map_err(|e| e.to_string())?;
+    let has_lens = missing == MissingCalibration::Mount;
     match too_uncertain(&found, has_lens) {
         Some(reason) => {
             Err(format!("{}; too uncertain to be used unasked: {reason}", report::values(&found)))
@@ -249,8 +250,41 @@ pub(crate) fn found_in_words(
     }
 }
 
-/// Follows features through the recording and estimates.
-fn look(dataset: &Recording, events: &Events, cancel: &CancelToken) -> Result<Calibration, Error> {
+/// Finds what is missing: with the lens where that is given.
+fn look_for(
+    missing: MissingCalibration,
+    dataset: &Recording,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Calibration, Error> {
+    let camera = dataset.rig.camera(dataset.camera).filter(|_| missing == MissingCalibration::Mount);
+    let mount = assumed_mount(dataset);
+    let lens = camera.map(|c| &c.model);
+    let known = KnownCamera { lens, mount: None, assumed_mount: mount.as_ref() };
+    events.stage(STAGE, 0, || look(dataset, &known, events, cancel))
+}
+
+/// Clock and readout of a camera whose lens and place on the IMU are given, and the rotation where that is not the given one. `None` where the recording
+/// does not show them.
+pub(crate) fn of_given_camera(
+    dataset: &Recording,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Option<Calibration> {
+    let camera = dataset.rig.camera(dataset.camera)?;
+    let mount = camera.body_from_camera.rotation;
+    let known = KnownCamera { lens: Some(&camera.model), mount: Some(&mount), assumed_mount: None };
+    let found = look(dataset, &known, events, cancel).ok()?;
+    (too_uncertain(&found, true).is_none() && found.time_offset_secs.is_observable).then_some(found)
+}
+
+/// Follows features through the recording and estimates, by what is known where nothing contradicts it.
+fn look(
+    dataset: &Recording,
+    known: &KnownCamera<'_>,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Calibration, Error> {
     let refuse = |reason: &str| Error::NotCalibrated { name: dataset.name.clone(), reason: reason.into() };
     if dataset.imu.is_empty() {
         return Err(refuse("it has no gyroscope"));
@@ -281,14 +315,19 @@ fn look(dataset: &Recording, events: &Events, cancel: &CancelToken) -> Result<Ca
             Measurement::Event(_) | Measurement::Stamp(_) | Measurement::Unreadable(..) => {}
         }
     }
-    let found = log.calibrate(width, height, assumed_mount(dataset).as_ref());
+    let by = |lens| log.calibrate(width, height, &KnownCamera { lens, ..*known });
+    let found = match known.lens.map(|lens| by(Some(lens))) {
+        Some(Ok(found)) if agrees_with_its_lens(&found) => Ok(found),
+        Some(held) => by(None).or(held),
+        None => by(None),
+    };
     let is_doubtful = match &found {
         Ok(found) => found.pixel_sigma > DOUBTFUL_PX,
         Err(failure) => *failure == CalibrationFailure::Unexplained,
     };
     let left = found.as_ref().map_or(f64::INFINITY, |found| found.pixel_sigma);
     if is_doubtful
-        && let Ok(other) = opposite.calibrate(width, height, None)
+        && let Ok(other) = opposite.calibrate(width, height, &KnownCamera::default())
         && other.pixel_sigma < DOUBTFUL_PX.min(LEFT_BY_THE_RIGHT_SIGNS * left)
     {
         return Err(refuse(&format!(
@@ -304,6 +343,14 @@ fn look(dataset: &Recording, events: &Events, cancel: &CancelToken) -> Result<Ca
         found => found.map_err(|failure| refuse(reason(failure))),
     }
 }
+
+/// Whether what was found with a given lens explains the tracks with one near it.
+fn agrees_with_its_lens(found: &Calibration) -> bool {
+    found.off_given_lens.is_some_and(|off| off < MOST_OFF_LENS) && found.pixel_sigma < DOUBTFUL_PX
+}
+
+/// A given lens is not the recording's where the focal length goes this many of its standard deviations away.
+const MOST_OFF_LENS: f64 = 2.0;
 
 /// What a calibration leaves of the tracks, px, above which the gyroscope's signs are doubted: 0.1 to 0.2 in rendered recordings, 0.76 in the same
 /// with one axis or all of them turned.
@@ -366,7 +413,7 @@ fn vague_focal(found: &Calibration) -> Option<String> {
 }
 
 /// A readout that is not there within three standard deviations and below 4 ms is a global shutter's.
-fn used_readout_ms(found: &Calibration) -> f64 {
+pub(crate) fn used_readout_ms(found: &Calibration) -> f64 {
     let readout = found.readout_secs;
     let is_global = readout.value < (3.0 * readout.sigma).min(0.004);
     if is_global { 0.0 } else { 1e3 * readout.value.clamp(0.0, 0.05) }

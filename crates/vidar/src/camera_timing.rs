@@ -1,15 +1,17 @@
 //! Clock offset, rolling-shutter readout and rotation of the camera, found in a first pass over the beginning of a recording.
 //!
 //! Consumer recordings state none of them, and stamps that are 40 ms late or rows that take 25 ms make every odometry fail.
-//! The pass takes the first half minute at most and stops as soon as the values are settled.
+//! The pass stops as soon as it confirms the given values. Where it contradicts them, or tells nothing within ten seconds, clock and readout are found as those
+//! of a recording without calibration are, with lens and mount as given, and where that does not show them, as well as half a minute does.
 
+use crate::calibrate::{self, SETTLED_OFFSET_SECS};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
 use vidar_core::{LieGroup, SensorEvent, Warning};
-use vidar_dataset::Recording;
-use vidar_odometry::{CameraTiming, ImuUse, Odometry};
+use vidar_dataset::{CalibrationSource, Recording};
+use vidar_odometry::{CameraTiming, ImuUse, Odometry, TimingSearch};
 
 /// The stage's name in events.
 pub(crate) const STAGE: &str = "camera timing";
@@ -32,22 +34,23 @@ pub(crate) fn settle(
     if is_known || settings.imu == ImuUse::Off || dataset.rig.imu.is_none() {
         return Ok(None);
     }
-    let mut images = 0;
-    let sensors =
-        input::measurements(dataset, true).take_while(|_| !cancel.is_cancelled()).filter_map(|m| match m {
-            Measurement::Event(event) => Some(event),
-            // The pass that maps reports what cannot be read.
-            Measurement::Stamp(_) | Measurement::Unreadable(..) => None,
-        });
-    let counted = sensors.inspect(|event| {
-        if matches!(event, SensorEvent::Image(_)) {
-            images += 1;
-            events.emit(&Event::Progress { stage: STAGE, done: images, total: 0 });
+    let given = Given { dataset, config, events, cancel };
+    // What was found from the recording is not found once more.
+    let is_given = dataset.calibration != CalibrationSource::Recording;
+    let mut timing = given.search(if is_given { TimingSearch::Confirm } else { TimingSearch::Settle })?;
+    let mut is_clock_known = false;
+    if is_given && (timing.is_corrected || !timing.is_settled) {
+        match given.calibrated() {
+            Some(calibrated) => {
+                timing = calibrated;
+                is_clock_known = timing.sigmas_secs.is_some_and(|s| s.0 < SETTLED_OFFSET_SECS);
+            }
+            None => timing = given.search(TimingSearch::Settle)?,
         }
-    });
-    let timing = Odometry::find_timing(&dataset.rig, dataset.camera, settings, counted)?;
+    }
     // What half a minute shows is not to be given up for what the first seconds show.
     config.odometry.align_timing &= timing.sigmas_secs.is_none();
+    config.odometry.estimate_time_offset &= !is_clock_known;
     if !timing.is_corrected {
         return Ok(None);
     }
@@ -56,6 +59,70 @@ pub(crate) fn settle(
     timing.apply(camera, &mut config.odometry);
     Ok(Some(corrected(&timing, turn.angle_rad().to_degrees())))
 }
+
+/// A recording with the values that were given.
+struct Given<'a> {
+    dataset: &'a Recording,
+    config: &'a Config,
+    events: &'a Events,
+    cancel: &'a CancelToken,
+}
+
+impl Given<'_> {
+    /// What an odometry finds from the first seconds.
+    fn search(&self, search: TimingSearch) -> Result<CameraTiming, Error> {
+        let Self { dataset, config, events, cancel } = *self;
+        let mut images = 0;
+        let sensors = input::measurements(dataset, true).take_while(|_| !cancel.is_cancelled()).filter_map(
+            |m| match m {
+                Measurement::Event(event) => Some(event),
+                // The pass that maps reports what cannot be read.
+                Measurement::Stamp(_) | Measurement::Unreadable(..) => None,
+            },
+        );
+        let counted = sensors.inspect(|event| {
+            if matches!(event, SensorEvent::Image(_)) {
+                images += 1;
+                events.emit(&Event::Progress { stage: STAGE, done: images, total: 0 });
+            }
+        });
+        Ok(Odometry::find_timing(&dataset.rig, dataset.camera, &config.odometry, search, counted)?)
+    }
+
+    /// What the calibration of a recording finds with the given lens and mount.
+    fn calibrated(&self) -> Option<CameraTiming> {
+        let Self { dataset, config, events, cancel } = *self;
+        let found = calibrate::of_given_camera(dataset, events, cancel)?;
+        let camera = dataset.rig.camera(dataset.camera)?;
+        let settings = &config.odometry;
+        let (clock, given_secs) = (found.time_offset_secs, camera.time_offset.as_secs_f64());
+        let is_other_clock = settings.estimate_time_offset
+            && (clock.value - given_secs).abs() > (CONTRADICTING_SIGMAS * clock.sigma).max(MIN_OFFSET_SECS);
+        let found_readout_ms =
+            if found.readout_secs.is_observable { calibrate::used_readout_ms(&found) } else { 0.0 };
+        let readout_ms = settings.readout_ms.unwrap_or(found_readout_ms);
+        let rotation_sigma = found.rotation_sigmas.iter().fold(0.0, |a: f64, s| a.max(*s));
+        let turn = (camera.body_from_camera.rotation.inverse() * found.body_from_camera).angle_rad();
+        let is_turned = turn > (CONTRADICTING_SIGMAS * rotation_sigma).max(MIN_ROTATION_RAD);
+        let mut body_from_camera = camera.body_from_camera;
+        if is_turned {
+            body_from_camera.rotation = found.body_from_camera;
+        }
+        Some(CameraTiming {
+            time_offset_secs: if is_other_clock { clock.value } else { given_secs },
+            readout_secs: 1e-3 * readout_ms,
+            body_from_camera,
+            sigmas_secs: Some((clock.sigma, found.readout_secs.sigma)),
+            is_corrected: is_other_clock || is_turned || settings.readout_ms.is_none() && readout_ms > 0.0,
+            is_settled: true,
+        })
+    }
+}
+
+/// Values are corrected where they differ from the given ones by so many standard deviations, and by this much.
+const CONTRADICTING_SIGMAS: f64 = 3.0;
+const MIN_OFFSET_SECS: f64 = 0.002;
+const MIN_ROTATION_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
 
 fn corrected(timing: &CameraTiming, turn_deg: f64) -> Warning {
     let (offset_sigma, readout_sigma) = timing.sigmas_secs.unwrap_or((f64::NAN, f64::NAN));

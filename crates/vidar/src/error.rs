@@ -123,7 +123,7 @@ pub enum Error {
         name: String,
     },
     /// The recording does not show its calibration.
-    #[error("{name} has no calibration, and the recording does not show it: {reason}")]
+    #[error("the calibration of {name} cannot be found from the recording: {reason}")]
     NotCalibrated {
         /// Name of the recording.
         name: String,

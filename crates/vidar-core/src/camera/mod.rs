@@ -217,6 +217,15 @@ impl CameraModel {
         all
     }
 
+    /// Whether it is a pinhole, or has distortion coefficients that are all zero.
+    pub fn is_undistorted(&self) -> bool {
+        match self {
+            Self::Pinhole(_) => true,
+            Self::RadTan(_) => self.parameters().iter().skip(4).all(|k| *k == 0.0),
+            Self::Equidistant(_) | Self::DoubleSphere(_) | Self::Fov(_) => false,
+        }
+    }
+
     /// Columns of the image.
     pub fn width(&self) -> usize {
         self.intrinsics().width

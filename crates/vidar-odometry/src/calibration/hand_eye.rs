@@ -6,7 +6,6 @@
 //! calibration). Translation disturbs the images' rotations: this is a start to some degrees and some ten milliseconds, and
 //! tells the axis permutation.
 
-use super::lens::LensModel;
 use super::parameters::Parameters;
 use super::path::GyroPath;
 use crate::gyro_alignment::{ImageFeatures, common};
@@ -36,20 +35,17 @@ pub(super) struct Start {
     pub is_another_clock: bool,
 }
 
-/// Starts with a kind of lens in the order of what they leave unexplained: the best clock offset of every trial focal length, and others
+/// Starts with each of `trials` in the order of what they leave unexplained: the best clock offset of every one, and others
 /// that leave hardly more. The camera is mounted as `mount` says, else as the rates say. Empty where the body turned too little.
 pub(super) fn starts(
-    lens: LensModel,
+    trials: &[Parameters],
     mount: Option<&So3>,
-    size: (f64, f64),
     images: &[ImageFeatures],
     path: &GyroPath,
-    readout_secs: f64,
 ) -> Vec<Start> {
     let mut found: Vec<Start> = Vec::new();
-    for widths in lens.trial_focals() {
-        let parameters = Parameters::plain(lens, widths * size.0, size, readout_secs);
-        let seen = image_rates(&parameters, images);
+    for parameters in trials {
+        let seen = image_rates(parameters, images);
         if seen.len() < MIN_PAIRS {
             return Vec::new();
         }
@@ -70,7 +66,7 @@ pub(super) fn starts(
                     Some(mount) => explained_by(mount, &rates),
                     None => best_rotation(&rates)?,
                 };
-                let parameters = Parameters { offset_secs, body_from_camera, bias, ..parameters };
+                let parameters = Parameters { offset_secs, body_from_camera, bias, ..*parameters };
                 Some(Start { parameters, unexplained, is_another_clock: false })
             })
             .collect();
@@ -87,7 +83,7 @@ pub(super) fn starts(
     }
     // Turning nearly about one axis shows a mount with long focal lengths only, with which images seem to turn more about the others: short ones are
     // tried with it, too.
-    let focals = lens.trial_focals().iter().map(|widths| widths * size.0);
+    let focals = trials.iter().map(|trial| trial.focal);
     let missing: Vec<f64> =
         focals.filter(|focal| found.iter().all(|s| s.parameters.focal != *focal)).collect();
     if let Some(best) = found.iter().min_by(|a, b| a.unexplained.total_cmp(&b.unexplained)).copied() {
@@ -194,6 +190,7 @@ fn rotation_between(pairs: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Vector3<f6
 
 #[cfg(test)]
 mod tests {
+    use super::super::lens::LensModel;
     use super::*;
     use crate::gyro_alignment::RateSample;
     use crate::simulate::Handheld;
@@ -210,7 +207,8 @@ mod tests {
         };
         let images: Vec<ImageFeatures> = recording.images.iter().map(image).collect();
         let path = GyroPath::new(&samples, &Vector3::zeros(), &Vector3::zeros());
-        starts(LensModel::RadTan, None, (640.0, 480.0), &images, &path, 0.015)
+        let trials = Parameters::trials(LensModel::RadTan, (640.0, 480.0), 0.015);
+        starts(&trials, None, &images, &path)
     }
 
     /// A lively hand shows its clock; one that is moved more than turned does not, and no clock is passed over.

@@ -1,4 +1,4 @@
-//! Calibration of a camera on an IMU from an ordinary recording, with nothing known but the images' size.
+//! Calibration of a camera on an IMU from an ordinary recording, with nothing known but the images' size, or the lens.
 //!
 //! 1. [`FeatureTracker`] follows corners from image to image without a camera model.
 //! 2. The rotations of image pairs, compared with the gyroscope's, give a start: clock offset and axis permutation.
@@ -27,11 +27,13 @@ pub use lens::LensModel;
 use nalgebra::Vector3;
 pub(crate) use noise::loud_noise;
 pub use noise::{SensorNoise, sensor_noise};
-use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, READOUT, ROTATION, prior_sigmas};
+use parameters::{BIAS, CENTRE, FOCAL, GivenLens, K1, K2, OFFSET, READOUT, ROTATION};
 use path::GyroPath;
+use solve::sigma_factor;
 pub use tracker::FeatureTracker;
 use tracks::{Solved, Tracks};
-use vidar_core::{ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
+use vidar_core::camera::{CameraModel, Pixel};
+use vidar_core::{ImuSample, LandmarkId, So3, Timestamp};
 
 /// Images nearer in time than this add little and cost as much, s.
 const IMAGE_SPACING_SECS: f64 = 0.09;
@@ -49,10 +51,6 @@ const START_READOUT_SECS: f64 = 0.015;
 /// fitted to that of the pixels, and whatever fits best looks certain (a camera at rest gave a clock to 4 ms).
 const MIN_TURNING: f64 = 0.03;
 
-/// Standard deviations from the residuals are multiplied by this: found on simulated recordings
-/// (`tests/calibration.rs`), where the share of errors beyond 3 σ has to be below 2 %.
-const SIGMA_FACTOR: f64 = 1.5;
-
 /// The readout's standard deviation is at least this share of it: positions between images are parabolas, which underrate a
 /// hand's fastest translation (errors of 0.6 ms at readouts of 30 ms, `tests/calibration.rs`).
 const READOUT_SHARE: f64 = 0.01;
@@ -64,11 +62,6 @@ const READOUT_SHARE: f64 = 0.01;
 const ROTATION_FLOOR: f64 = 0.0026;
 const FOCAL_FLOOR: f64 = 0.0015;
 const CENTRE_FLOOR: f64 = 0.004;
-
-/// Few stretches tell little of errors that each of them shares: standard deviations are multiplied by 1 + this over their
-/// number. Ten simulated recordings of 3 s had errors of 0.2 to 0.4 standard deviations (RMS) with 3 here; real lenses have
-/// more that the model leaves out than simulated ones.
-const FEW_STRETCHES: f64 = 1.0;
 
 /// How well a clock can be known where images turn otherwise than the gyroscope says, s: a stabiliser that follows the hand late looks like a clock that is
 /// late. Those of four rendered recordings were 11 to 20 ms off at stated 2 to 6.
@@ -94,6 +87,8 @@ pub struct Calibration {
     pub centre_px: [Estimate; 2],
     /// The kind of lens that the next two belong to.
     pub lens: LensModel,
+    /// Where a lens was given, by how many of its standard deviations the focal length is off that one's.
+    pub off_given_lens: Option<f64>,
     /// Radial distortion, k1 and k2 of the lens.
     pub radial: [Estimate; 2],
     /// `t_imu = stamp + offset` for the centre row, s.
@@ -104,7 +99,7 @@ pub struct Calibration {
     pub body_from_camera: So3,
     /// Standard deviation about each axis of the camera, rad.
     pub rotation_sigmas: [f64; 3],
-    /// Whether the mount was assumed, within some degrees, because the recording does not show it.
+    /// Whether the mount was given, or assumed because the recording does not show it, and held within some degrees.
     pub mount_is_assumed: bool,
     /// Whether the rotation is observable about every axis.
     pub rotation_is_observable: bool,
@@ -126,6 +121,18 @@ pub struct Calibration {
 pub struct CalibrationLog {
     images: Vec<(Timestamp, Vec<(LandmarkId, Pixel)>)>,
     samples: Vec<ImuSample>,
+}
+
+/// What is known of a camera before its recording is looked at.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct KnownCamera<'a> {
+    /// The lens: it is held to a per cent where it was measured and to three where it has no distortion, and mount, clock and shutter are found by it.
+    pub lens: Option<&'a CameraModel>,
+    /// The rotation body_from_camera, if it was measured: it is held within some degrees where that explains the tracks.
+    pub mount: Option<&'a So3>,
+    /// The rotation body_from_camera with which cameras of this kind are mounted: taken, as it is, turned about the view by quarter turns, or looking the
+    /// other way, where the body turns too little to show the mount, or about one axis only as in a hand that walks.
+    pub assumed_mount: Option<&'a So3>,
 }
 
 /// Why there is no calibration.
@@ -173,9 +180,7 @@ impl CalibrationLog {
         }
     }
 
-    /// Estimates the calibration of a camera with images of `width` × `height`. Where the body turns too little to show how the
-    /// camera is mounted, or about one axis only as in a hand that walks, the camera is taken as mounted as `assumed`, turned
-    /// about its view by quarter turns, or looking the other way.
+    /// Estimates the calibration of a camera with images of `width` × `height`, of which `known` is known.
     ///
     /// # Errors
     /// Says why the recording does not show it; never an error of the program.
@@ -183,7 +188,7 @@ impl CalibrationLog {
         &self,
         width: usize,
         height: usize,
-        assumed: Option<&So3>,
+        known: &KnownCamera<'_>,
     ) -> Result<Calibration, CalibrationFailure> {
         let Some(origin) = self.images.first().map(|(t, _)| *t) else {
             return Err(CalibrationFailure::TooLittleData);
@@ -223,13 +228,18 @@ impl CalibrationLog {
             as_measured: &as_measured,
             gyro_noise,
             windows: &windows,
+            lens: known.lens.and_then(|lens| GivenLens::of(lens, START_READOUT_SECS)),
         };
-        let found = tracks.explained_by_any_lens(None).and_then(|solved| calibration(&tracks, &solved));
+        let by_given = known.mount.and_then(|mount| tracks.explained_by_a_given_mount(mount));
+        if let Some(solved) = by_given {
+            return calibration(&tracks, &solved);
+        }
+        let found = tracks.explained_by_a_lens(None).and_then(|solved| calibration(&tracks, &solved));
         let is_decided = match &found {
             Ok(found) => found.rotation_is_observable,
             Err(failure) => *failure != CalibrationFailure::TooLittleRotation,
         };
-        let Some(assumed) = assumed.filter(|_| !is_decided) else { return found };
+        let Some(assumed) = known.assumed_mount.filter(|_| !is_decided) else { return found };
         let usual = calibration(&tracks, &tracks.explained_by_a_mount(assumed)?)?;
         if usual.rotation_is_observable { Ok(usual) } else { Err(CalibrationFailure::TooLittleRotation) }
     }
@@ -244,9 +254,9 @@ fn calibration(
     let stretches = tracks.windows.len();
     let [formal, spread] = problem.covariances(solution).ok_or(CalibrationFailure::Unexplained)?;
     let x = &solution.parameters;
-    let priors = prior_sigmas(x.lens, width);
+    let priors = problem.sigmas();
     let gyro_noise_ratio = solution.gyro_noise_ratio();
-    let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / stretches as f64) * gyro_noise_ratio;
+    let factor = sigma_factor(stretches, gyro_noise_ratio);
     let sigma = |p: usize| {
         let floor = match p {
             FOCAL => FOCAL_FLOOR,
@@ -270,6 +280,7 @@ fn calibration(
         focal_px: Estimate { sigma: focal.sigma * x.focal, is_observable: focal.sigma < 0.1, ..focal },
         centre_px: [estimate(CENTRE, x.centre.x), estimate(CENTRE + 1, x.centre.y)],
         lens: x.lens,
+        off_given_lens: problem.lens.map(|given| given.off(x.focal)),
         radial: [estimate(K1, x.k1), estimate(K2, x.k2)],
         time_offset_secs: estimate(OFFSET, x.offset_secs),
         readout_secs: estimate(READOUT, x.readout_secs),

@@ -1,8 +1,8 @@
 //! What is estimated for the whole recording, and its prior.
 
 use super::lens::LensModel;
-use nalgebra::{Matrix2x3, SMatrix, SVector, Vector2, Vector3};
-use vidar_core::camera::Pixel;
+use nalgebra::{Matrix2x3, Matrix3, SMatrix, SVector, Vector2, Vector3};
+use vidar_core::camera::{CameraModel, Pixel};
 use vidar_core::{LieGroup, So3};
 
 /// Number of parameters.
@@ -54,6 +54,80 @@ pub(super) fn prior_sigmas(lens: LensModel, width: f64) -> Tangent {
     ])
 }
 
+/// How far a measured lens is believed (σ): a calibration by a chessboard is right to some tenths of a per cent, and an autofocus moves the focal length by
+/// one per cent since. Focal length (relative), k1, k2, and the principal point in image widths.
+const MEASURED_FOCAL: f64 = 0.01;
+const MEASURED_RADIAL: f64 = 0.02;
+const MEASURED_CENTRE: f64 = 0.005;
+/// The focal length of a lens without distortion, which nobody measured: data sheets and other recordings of the same model are right to some per cent.
+const STATED_FOCAL: f64 = 0.03;
+
+/// Places in an image, along each side, at which a given lens is asked.
+const PLACES: usize = 9;
+
+/// A lens that is given.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct GivenLens {
+    /// The camera, as far as a focal length and two coefficients say it, in the body's axes.
+    pub camera: Parameters,
+    /// Whether it has distortion: somebody measured it.
+    pub is_measured: bool,
+    /// Its standard deviations are divided by this: by how much the stretches of a recording differ from each other more than their residuals say.
+    pub weight: f64,
+}
+
+impl GivenLens {
+    /// By least squares of the radii over the image. `None` where a focal length and two coefficients do not say it.
+    pub fn of(model: &CameraModel, readout_secs: f64) -> Option<Self> {
+        let lens = match model {
+            CameraModel::Pinhole(_) | CameraModel::RadTan(_) => LensModel::RadTan,
+            _ => LensModel::Equidistant,
+        };
+        let size = (model.width() as f64, model.height() as f64);
+        let centre = model.principal_point();
+        let share = |k: usize| k as f64 / (PLACES - 1) as f64;
+        let (mut h, mut g) = (Matrix3::<f64>::zeros(), Vector3::zeros());
+        for (row, column) in (0..PLACES).flat_map(|row| (0..PLACES).map(move |column| (row, column))) {
+            let pixel = Pixel::new(share(column) * (size.0 - 1.0), share(row) * (size.1 - 1.0));
+            let Some(ray) = model.unproject(&pixel) else { continue };
+            let theta = ray.xy().norm().atan2(ray.z);
+            let t = if lens == LensModel::RadTan { theta.tan() } else { theta };
+            let powers = Vector3::new(t, t.powi(3), t.powi(5));
+            h += powers * powers.transpose();
+            g += powers * (pixel - centre).norm();
+        }
+        let radius = h.cholesky()?.solve(&g);
+        let (focal, k1, k2) = (radius.x, radius.y / radius.x, radius.z / radius.x);
+        if !(focal > 0.0 && [focal, k1, k2].iter().all(|x| x.is_finite())) {
+            return None;
+        }
+        let camera = Parameters { k1, k2, centre, ..Parameters::plain(lens, focal, size, readout_secs) };
+        Some(Self { camera, is_measured: !model.is_undistorted(), weight: 1.0 })
+    }
+
+    fn focal_sigma(&self) -> f64 {
+        if self.is_measured { MEASURED_FOCAL } else { STATED_FOCAL }
+    }
+
+    /// By how many of its standard deviations a focal length is off its own.
+    pub fn off(&self, focal: f64) -> f64 {
+        (focal / self.camera.focal).ln().abs() / self.focal_sigma()
+    }
+
+    /// What is believed before a recording is looked at.
+    pub fn sigmas(&self, width: f64) -> Tangent {
+        let mut sigmas = prior_sigmas(self.camera.lens, width);
+        sigmas[FOCAL] = self.focal_sigma();
+        if self.is_measured {
+            (sigmas[K1], sigmas[K2]) = (MEASURED_RADIAL, MEASURED_RADIAL);
+            sigmas.fixed_rows_mut::<2>(CENTRE).fill(MEASURED_CENTRE * width);
+        }
+        let mut of_the_lens = sigmas.fixed_rows_mut::<LENS>(0);
+        of_the_lens /= self.weight;
+        sigmas
+    }
+}
+
 /// A pixel with its derivatives by the point and by the lens.
 pub(super) struct Projection {
     pub pixel: Pixel,
@@ -76,6 +150,12 @@ impl Parameters {
             bias: Vector3::zeros(),
             scale: Vector3::zeros(),
         }
+    }
+
+    /// [`Parameters::plain`] with each of a lens's trial focal lengths.
+    pub fn trials(lens: LensModel, size: (f64, f64), readout_secs: f64) -> Vec<Self> {
+        let focals = lens.trial_focals().iter().map(|widths| widths * size.0);
+        focals.map(|focal| Self::plain(lens, focal, size, readout_secs)).collect()
     }
 
     /// The parameters moved by a tangent vector.

@@ -16,6 +16,10 @@ fn log_of(truth: &Handheld) -> CalibrationLog {
     log
 }
 
+fn mounted(assumed: &So3) -> KnownCamera<'_> {
+    KnownCamera { assumed_mount: Some(assumed), ..KnownCamera::default() }
+}
+
 /// A stretch of four images with nothing special about it.
 fn small() -> (Window, Parameters, Vec<RateSample>) {
     let mut r = Random::new(5);
@@ -110,7 +114,10 @@ fn steps_of_nodes_and_points_descend_to_the_optimum() {
 #[test]
 fn the_same_recording_gives_the_same_bits() {
     let log = log_of(&Handheld { secs: 6.0, ..Handheld::draw(3) });
-    let [a, b] = [log.calibrate(640, 480, None).unwrap(), log.calibrate(640, 480, None).unwrap()];
+    let [a, b] = [
+        log.calibrate(640, 480, &KnownCamera::default()).unwrap(),
+        log.calibrate(640, 480, &KnownCamera::default()).unwrap(),
+    ];
     assert_eq!(a.focal_px.value.to_bits(), b.focal_px.value.to_bits());
     assert_eq!(a.time_offset_secs.sigma.to_bits(), b.time_offset_secs.sigma.to_bits());
 }
@@ -118,7 +125,7 @@ fn the_same_recording_gives_the_same_bits() {
 #[test]
 fn a_camera_at_rest_is_refused_or_not_observable() {
     let still = Handheld { turning: 1e-4, moving: 1e-4, ..Handheld::draw(4) };
-    match log_of(&still).calibrate(640, 480, None) {
+    match log_of(&still).calibrate(640, 480, &KnownCamera::default()) {
         Err(failure) => assert_eq!(failure, CalibrationFailure::TooLittleRotation),
         Ok(found) => {
             assert!(!found.focal_px.is_observable && !found.time_offset_secs.is_observable, "{found:?}");
@@ -138,8 +145,8 @@ fn turning_about_one_axis_calibrates_a_camera_that_is_mounted_as_usual() {
         let truth = Handheld { pixel_noise: 0.25, outliers: 0.02, ..motion };
         let log = log_of(&truth);
         let none = CalibrationFailure::TooLittleRotation;
-        assert_eq!(log.calibrate(640, 480, None).unwrap_err(), none, "{seed}");
-        let found = log.calibrate(640, 480, Some(&(truth.body_from_camera * askew))).unwrap();
+        assert_eq!(log.calibrate(640, 480, &KnownCamera::default()).unwrap_err(), none, "{seed}");
+        let found = log.calibrate(640, 480, &mounted(&(truth.body_from_camera * askew))).unwrap();
         let turn = (truth.body_from_camera.inverse() * found.body_from_camera).log();
         let off = |found: &Estimate, truth: f64| (found.value - truth).abs() / found.sigma;
         let sigmas = [
@@ -152,7 +159,7 @@ fn turning_about_one_axis_calibrates_a_camera_that_is_mounted_as_usual() {
         // None of these two is told from the one that is turned by half a turn about the body's axis.
         for other in [quarter, quarter * side] {
             let usual = truth.body_from_camera * askew * other;
-            match log.calibrate(640, 480, Some(&usual)) {
+            match log.calibrate(640, 480, &mounted(&usual)) {
                 Err(failure) => assert_eq!(failure, none, "{seed}"),
                 Ok(found) => {
                     let turn = (truth.body_from_camera.inverse() * found.body_from_camera).angle_rad();
@@ -169,21 +176,49 @@ fn turning_about_one_axis_calibrates_a_camera_that_is_mounted_as_usual() {
     let motion = Handheld { main_axis: (1, 0.04), secs: 8.0, turning: 0.5, ..Handheld::draw(11) };
     let truth = Handheld { pixel_noise: 0.25, outliers: 0.02, ..motion };
     let usual = truth.body_from_camera * askew * quarter * side;
-    let found = log_of(&truth).calibrate(640, 480, Some(&usual)).unwrap();
+    let found = log_of(&truth).calibrate(640, 480, &mounted(&usual)).unwrap();
     let turn = (truth.body_from_camera.inverse() * found.body_from_camera).angle_rad();
     assert!(found.mount_is_assumed && turn < 0.06, "turned by {turn}");
+}
+
+/// What a given lens is turned into projects as it does.
+#[test]
+fn a_given_lens_projects_as_its_model() {
+    use vidar_core::camera::{DoubleSphere, Equidistant, Pinhole, RadTan};
+    let pinhole = Pinhole::new(410.0, 411.0, 315.0, 244.0, 640, 480).unwrap();
+    let models = [
+        CameraModel::Pinhole(pinhole),
+        CameraModel::RadTan(RadTan::new(pinhole, [-0.2, 0.04, 3e-4, -2e-4]).unwrap()),
+        CameraModel::Equidistant(Equidistant::new(pinhole, [0.03, -0.01, 0.004, -0.001]).unwrap()),
+        CameraModel::DoubleSphere(DoubleSphere::new(pinhole, -0.2, 0.55).unwrap()),
+    ];
+    for model in models {
+        let given = GivenLens::of(&model, 0.01).unwrap();
+        assert_eq!(given.is_measured, !matches!(model, CameraModel::Pinhole(_)));
+        for pixel in [Pixel::new(40.0, 30.0), Pixel::new(320.0, 240.0), Pixel::new(600.0, 100.0)] {
+            let ray = model.unproject(&pixel).unwrap();
+            let off = (given.camera.project(&ray).unwrap().pixel - pixel).norm();
+            assert!(off < 0.6, "{model:?}: {off} px at {pixel}");
+        }
+    }
 }
 
 #[test]
 fn nothing_and_nonsense_are_refused() {
     let empty = CalibrationLog::default();
-    assert_eq!(empty.calibrate(640, 480, None).unwrap_err(), CalibrationFailure::TooLittleData);
+    assert_eq!(
+        empty.calibrate(640, 480, &KnownCamera::default()).unwrap_err(),
+        CalibrationFailure::TooLittleData
+    );
     let truth = Handheld { secs: 3.0, ..Handheld::draw(9) };
     let mut log = CalibrationLog::default();
     for sample in truth.record().samples {
         log.add_gyro(&ImuSample { gyro: AngularRate(Vector3::repeat(f64::NAN)), ..sample });
     }
-    assert_eq!(log.calibrate(640, 480, None).unwrap_err(), CalibrationFailure::TooLittleData);
+    assert_eq!(
+        log.calibrate(640, 480, &KnownCamera::default()).unwrap_err(),
+        CalibrationFailure::TooLittleData
+    );
 }
 
 #[test]

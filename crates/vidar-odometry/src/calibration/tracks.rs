@@ -2,7 +2,7 @@
 
 use super::hand_eye::{self, Start};
 use super::lens::LensModel;
-use super::parameters::Parameters;
+use super::parameters::{FOCAL, GivenLens, Parameters};
 use super::path::GyroPath;
 use super::solve::{Problem, Solution};
 use super::window::Window;
@@ -10,7 +10,7 @@ use super::{CalibrationFailure, START_READOUT_SECS};
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
 use std::f64::consts::{FRAC_PI_2, PI};
-use vidar_core::So3;
+use vidar_core::{LieGroup, So3};
 
 /// A radial-tangential lens as wide as this (focal length in image widths; 78°) may be a fisheye, and one that leaves more than
 /// this much of the tracks, px, may be anything else.
@@ -22,6 +22,8 @@ const MARGIN: f64 = 0.02;
 
 /// How far an assumed mount may be off, rad (σ): cameras stand in phones within a degree or two.
 const MOUNT_SIGMA: f64 = 0.05;
+/// A given mount is not the recording's where it would be turned by more than this many standard deviations.
+const MOST_TURN: f64 = 3.0;
 /// Mounts that are refined: the assumed one and those whose rates fit best. Turning about one axis leaves at least two that differ by half a turn
 /// about it.
 const REFINED_MOUNTS: usize = 3;
@@ -39,14 +41,24 @@ pub(super) struct Tracks<'a> {
     pub as_measured: &'a GyroPath,
     pub gyro_noise: f64,
     pub windows: &'a [Window],
+    /// The lens, where it is given.
+    pub lens: Option<GivenLens>,
 }
 
 /// A problem and its solution.
 pub(super) type Solved<'a> = (Problem<'a>, Solution);
 
-impl Tracks<'_> {
-    /// A radial-tangential lens, or a fisheye where that one is wide or explains little and a fisheye explains more.
-    pub fn explained_by_any_lens(&self, mount: Option<&So3>) -> Result<Solved<'_>, CalibrationFailure> {
+impl<'a> Tracks<'a> {
+    /// The given lens; else a radial-tangential one, or a fisheye where that one is wide or explains little and a fisheye explains more.
+    pub fn explained_by_a_lens(&self, mount: Option<&So3>) -> Result<Solved<'a>, CalibrationFailure> {
+        if let Some(given) = &self.lens {
+            let (problem, solution) = self.explained_by(given.camera.lens, mount)?;
+            // What is given weighs as much against what the stretches say as that is worth.
+            let weight = problem.understatement(&solution, FOCAL).ok_or(CalibrationFailure::Unexplained)?;
+            let lens = Some(GivenLens { weight, ..*given });
+            let again = Tracks { lens, ..*self }.solved(&[solution.parameters], mount);
+            return again.ok_or(CalibrationFailure::Unexplained);
+        }
         let narrow = self.explained_by(LensModel::RadTan, mount);
         let is_narrow =
             |s: &Solution| s.parameters.focal > WIDE_FOCAL * self.size.0 && s.noise.pixel < DOUBTFUL_PX;
@@ -63,9 +75,17 @@ impl Tracks<'_> {
         }
     }
 
+    /// A lens on a camera that is mounted as `given`, where that explains the tracks.
+    pub fn explained_by_a_given_mount(&self, given: &So3) -> Option<Solved<'a>> {
+        let (problem, solution) = self.explained_by_a_lens(Some(given)).ok()?;
+        let turn = (given.inverse() * solution.parameters.body_from_camera).angle_rad();
+        let is_explained = solution.noise.pixel < DOUBTFUL_PX && turn < MOST_TURN * MOUNT_SIGMA;
+        is_explained.then_some((problem, solution))
+    }
+
     /// Any lens on a camera that is mounted as `assumed`, turned about its view by quarter turns, or looks the other way. What turning about one
     /// axis does not tell apart is taken as assumed, or refused where it is none of these.
-    pub fn explained_by_a_mount(&self, assumed: &So3) -> Result<Solved<'_>, CalibrationFailure> {
+    pub fn explained_by_a_mount(&self, assumed: &So3) -> Result<Solved<'a>, CalibrationFailure> {
         let about = |axis: Vector3<f64>, angle: f64| So3::from_axis_angle(&axis, angle);
         let sides = [0.0, PI].map(|angle| *assumed * about(Vector3::y(), angle));
         let quarters = |side: So3| (0..4).map(move |k| side * about(Vector3::z(), f64::from(k) * FRAC_PI_2));
@@ -79,11 +99,11 @@ impl Tracks<'_> {
         // The assumed one first.
         mounts.sort_by(|a, b| b.1.cmp(&a.1).then(a.0.total_cmp(&b.0)));
         let refined = mounts.iter().take(REFINED_MOUNTS).filter_map(|(_, is_assumed, mount)| {
-            let solved = self.explained_by_any_lens(Some(mount)).ok()?;
+            let solved = self.explained_by_a_lens(Some(mount)).ok()?;
             let handicap = if *is_assumed { 0.0 } else { self.margin() };
             Some((solved.1.score() + handicap, *is_assumed, solved))
         });
-        let mut refined: Vec<(f64, bool, Solved<'_>)> = refined.collect();
+        let mut refined: Vec<(f64, bool, Solved<'a>)> = refined.collect();
         refined.sort_by(|a, b| b.0.total_cmp(&a.0));
         let Some((score, is_assumed, best)) = refined.pop() else {
             return Err(CalibrationFailure::TooLittleRotation);
@@ -99,10 +119,15 @@ impl Tracks<'_> {
     }
 
     fn starts(&self, lens: LensModel, mount: Option<&So3>) -> Vec<Start> {
-        hand_eye::starts(lens, mount, self.size, self.images, self.as_measured, START_READOUT_SECS)
+        let mut trials = match self.lens {
+            Some(given) if given.is_measured => Vec::new(),
+            _ => Parameters::trials(lens, self.size, START_READOUT_SECS),
+        };
+        trials.extend(self.lens.map(|given| given.camera));
+        hand_eye::starts(&trials, mount, self.images, self.as_measured)
     }
 
-    fn explained_by(&self, lens: LensModel, mount: Option<&So3>) -> Result<Solved<'_>, CalibrationFailure> {
+    fn explained_by(&self, lens: LensModel, mount: Option<&So3>) -> Result<Solved<'a>, CalibrationFailure> {
         let mut starts = self.starts(lens, mount);
         // With the mount, rates tell clock and focal length well enough.
         starts.truncate(if mount.is_some() { STARTS_OF_A_MOUNT } else { starts.len() });
@@ -113,16 +138,19 @@ impl Tracks<'_> {
         self.solved(&starts, mount).ok_or(CalibrationFailure::Unexplained)
     }
 
-    fn solved(&self, starts: &[Parameters], mount: Option<&So3>) -> Option<Solved<'_>> {
+    fn solved(&self, starts: &[Parameters], mount: Option<&So3>) -> Option<Solved<'a>> {
         let first = starts.first()?;
+        let usual =
+            || Parameters::plain(first.lens, USUAL_FOCAL * self.size.0, self.size, START_READOUT_SECS);
         let prior = Parameters {
             body_from_camera: mount.copied().unwrap_or(first.body_from_camera),
-            ..Parameters::plain(first.lens, USUAL_FOCAL * self.size.0, self.size, START_READOUT_SECS)
+            ..self.lens.map_or_else(usual, |given| given.camera)
         };
         let problem = Problem {
             samples: self.samples,
             width: self.size.0,
             prior,
+            lens: self.lens,
             mount_sigma: mount.map(|_| MOUNT_SIGMA),
             gyro_noise: self.gyro_noise,
             margin: self.margin(),

@@ -28,8 +28,9 @@ pub(super) fn values(found: &Calibration) -> String {
         false => "rotation against the IMU not observable in this recording".to_owned(),
     };
     format!(
-        "{}, {}, {}, {rotation}, lever arm 0 ± {UNKNOWN_LEVER_M} m{}",
+        "{}{}, {}, {}, {rotation}, lever arm 0 ± {UNKNOWN_LEVER_M} m{}",
         told("focal length", &found.focal_px, 1.0, "px", 1),
+        if found.off_given_lens.is_some() { " (held near the given one)" } else { "" },
         told("time offset", &found.time_offset_secs, 1e3, "ms", 1),
         told("readout", &found.readout_secs, 1e3, "ms", 1),
         disagreement(found).map(|words| format!("; {words}")).unwrap_or_default(),

@@ -19,6 +19,17 @@ const KNOWN_CLOCK_SECS: f64 = 1e-3;
 
 /// Stretch of a recording from which the camera's timing is found, s: a hand turns often enough within it.
 const TIMING_SECS: f64 = 30.0;
+/// Stretch within which given values are confirmed where they are right, s.
+const CONFIRMING_SECS: f64 = 10.0;
+
+/// How long clock, readout and rotation are looked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TimingSearch {
+    /// Until the given values are confirmed or contradicted.
+    Confirm,
+    /// Until what is found is settled.
+    Settle,
+}
 
 impl Odometry {
     /// The calibration as estimated on the way: where the camera is on the body, and what to add to image stamps to get
@@ -37,8 +48,8 @@ impl Odometry {
         self.time_calibration.timing(&self.camera, offset.as_secs_f64())
     }
 
-    /// Finds clock, readout and rotation of a camera from the beginning of a recording: events are taken until the values
-    /// are settled, for half a minute at most.
+    /// Finds clock, readout and rotation of a camera from the beginning of a recording: events are taken until `search` ends,
+    /// for half a minute at most.
     ///
     /// # Errors
     /// As [`Odometry::new`] and [`Odometry::push`].
@@ -46,6 +57,7 @@ impl Odometry {
         rig: &Rig,
         camera: CameraId,
         config: &OdometryConfig,
+        search: TimingSearch,
         events: impl IntoIterator<Item = SensorEvent>,
     ) -> Result<CameraTiming, OdometryError> {
         let mut odometry = Self::new(rig, camera, config)?;
@@ -57,7 +69,11 @@ impl Odometry {
             odometry.push(event)?;
             let Some(newest) = odometry.last_image else { continue };
             let seen_secs = (newest - *first.get_or_insert(newest)).as_secs_f64();
-            if odometry.time_calibration.is_settled() || seen_secs > TIMING_SECS {
+            let is_over = match search {
+                TimingSearch::Confirm => odometry.timing().is_corrected || seen_secs > CONFIRMING_SECS,
+                TimingSearch::Settle => seen_secs > TIMING_SECS,
+            };
+            if is_over || odometry.time_calibration.is_settled() {
                 break;
             }
         }
