@@ -6,6 +6,7 @@ use super::path::GyroPath;
 use super::window::{Noise, Reduced, Window};
 use crate::gyro_alignment::RateSample;
 use nalgebra::SMatrix;
+use rayon::prelude::*;
 use std::convert::Infallible;
 use vidar_core::LieGroup;
 use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
@@ -93,7 +94,7 @@ impl Problem<'_> {
     /// Refines from each start on few stretches, then the best of each clock on all, and takes the best of these. `None` where nothing converges.
     pub fn solve(&self, starts: &[Parameters], windows: &[Window]) -> Option<Solution> {
         let few: Vec<Window> = thinned(windows);
-        let starts = starts.iter().take(MAX_STARTS);
+        let starts = starts[..starts.len().min(MAX_STARTS)].par_iter();
         let coarse: Vec<Solution> =
             in_order(starts.filter_map(|start| self.refine(start, &few, COARSE)).collect());
         let mut clocks: Vec<&Parameters> = Vec::new();
@@ -103,7 +104,8 @@ impl Problem<'_> {
                 clocks.push(at);
             }
         }
-        let clocks = clocks.into_iter().take(MAX_CLOCKS);
+        clocks.truncate(MAX_CLOCKS);
+        let clocks = clocks.into_par_iter();
         let fine: Vec<Solution> =
             in_order(clocks.filter_map(|start| self.refine(start, windows, FINE)).collect());
         let spread = self.spread(&fine);
@@ -177,7 +179,9 @@ impl Problem<'_> {
     fn cost(&self, parameters: &Parameters, windows: &[Window], noise: &Noise) -> f64 {
         let path = self.path(parameters);
         let off = self.off_prior(parameters).component_div(&self.sigmas());
-        0.5 * off.norm_squared() + windows.iter().map(|w| w.cost(parameters, &path, noise)).sum::<f64>()
+        // Summed in their order, whichever thread is done first.
+        let costs: Vec<f64> = windows.par_iter().map(|w| w.cost(parameters, &path, noise)).collect();
+        0.5 * off.norm_squared() + costs.iter().sum::<f64>()
     }
 
     fn step(&self, at: &Solution, damping: f64, is_clock_held: bool) -> Option<Solution> {
@@ -208,7 +212,7 @@ impl Problem<'_> {
     ) -> Option<(SMatrix<f64, DIM, DIM>, Tangent, Vec<Reduced>)> {
         let path = self.path(parameters);
         let reduced = windows
-            .iter()
+            .par_iter()
             .map(|w| w.reduce(parameters, &path, noise, damping))
             .collect::<Option<Vec<Reduced>>>()?;
         let (sigmas, off) = (self.sigmas(), self.off_prior(parameters));

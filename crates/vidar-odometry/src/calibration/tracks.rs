@@ -22,6 +22,8 @@ const MARGIN: f64 = 0.02;
 
 /// How far an assumed mount may be off, rad (σ): cameras stand in phones within a degree or two.
 const MOUNT_SIGMA: f64 = 0.05;
+/// Nearer to a given focal length than this many of its standard deviations it does not matter what each of both is worth.
+const NEAR_ITS_LENS: f64 = 0.5;
 /// A given mount is not the recording's where it would be turned by more than this many standard deviations.
 const MOST_TURN: f64 = 3.0;
 /// Mounts that are refined: the assumed one and those whose rates fit best. Turning about one axis leaves at least two that differ by half a turn
@@ -53,6 +55,9 @@ impl<'a> Tracks<'a> {
     pub fn explained_by_a_lens(&self, mount: Option<&So3>) -> Result<Solved<'a>, CalibrationFailure> {
         if let Some(given) = &self.lens {
             let (problem, solution) = self.explained_by(given.camera.lens, mount)?;
+            if given.off(solution.parameters.focal) < NEAR_ITS_LENS {
+                return Ok((problem, solution));
+            }
             // What is given weighs as much against what the stretches say as that is worth.
             let weight = problem.understatement(&solution, FOCAL).ok_or(CalibrationFailure::Unexplained)?;
             let lens = Some(GivenLens { weight, ..*given });

@@ -20,7 +20,7 @@ const KNOWN_CLOCK_SECS: f64 = 1e-3;
 /// Stretch of a recording from which the camera's timing is found, s: a hand turns often enough within it.
 const TIMING_SECS: f64 = 30.0;
 /// Stretch within which given values are confirmed where they are right, s.
-const CONFIRMING_SECS: f64 = 10.0;
+const CONFIRMING_SECS: f64 = 5.0;
 
 /// How long clock, readout and rotation are looked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
