@@ -1,26 +1,22 @@
 //! Calibration of a recording from the recording itself: `vidar calibrate`, and what `odometry` and `run` do where there is
 //! no calibration.
 
+mod look;
 mod missing;
 mod report;
 mod yaml;
 
+pub(crate) use look::of_given_camera;
 pub use missing::MissingCalibration;
 
 use crate::error::Error;
-use crate::events::{CancelToken, Event, Events};
+use crate::events::{CancelToken, Events};
 use crate::imu_noise::believed_noise;
-use crate::input::{self, Measurement};
 use std::path::{Path, PathBuf};
-use vidar_core::{
-    AngularRate, CameraModel, Duration, ImuNoise, ImuSample, Pinhole, RigCamera, Se3, SensorEvent, So3,
-    Warning,
-};
+use vidar_core::{CameraModel, Duration, ImuNoise, Pinhole, RigCamera, Se3, Warning};
 use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::OdometryConfig;
-use vidar_odometry::calibration::{
-    Calibration, CalibrationFailure, CalibrationLog, FeatureTracker, KnownCamera, SensorNoise, sensor_noise,
-};
+use vidar_odometry::calibration::{Calibration, SensorNoise, sensor_noise};
 
 /// The stage's name in events.
 pub(crate) const STAGE: &str = "calibrate";
@@ -101,9 +97,7 @@ pub fn calibrate(
     cancel: &CancelToken,
 ) -> Result<CalibrateOutcome, Error> {
     let dataset = events.stage("read", 0, || vidar_dataset::open(&request.path, &request.open))?;
-    let mount = assumed_mount(&dataset);
-    let known = KnownCamera { assumed_mount: mount.as_ref(), ..KnownCamera::default() };
-    let calibration = events.stage(STAGE, 0, || look(&dataset, &known, events, cancel))?;
+    let calibration = look::everything(&dataset, events, cancel)?;
     let camera = dataset.rig.camera(dataset.camera);
     let is_stated = dataset.calibration != CalibrationSource::Guessed;
     let stated = camera.filter(|_| is_stated).map(|c| Stated {
@@ -147,7 +141,7 @@ pub(crate) fn has_no_mount(dataset: &Recording) -> bool {
     dataset.calibration != CalibrationSource::Guessed
         && !dataset.imu.is_empty()
         && (dataset.rig.camera(dataset.camera).is_some_and(RigCamera::has_no_mount)
-            || assumed_mount(dataset).is_some())
+            || look::assumed_mount(dataset).is_some())
 }
 
 /// Whether a lens is given by its focal length and principal point alone: nobody measured it.
@@ -193,7 +187,7 @@ pub(crate) fn complete(
 ) -> Result<(), Error> {
     let Some(missing) = MissingCalibration::of(dataset) else { return Ok(()) };
     let has_lens = missing == MissingCalibration::Mount;
-    let found = match look_for(missing, dataset, events, cancel) {
+    let found = match look::what_is_missing(missing, dataset, events, cancel) {
         Err(Error::NotCalibrated { .. }) if has_lens => return Ok(()),
         found => found?,
     };
@@ -240,7 +234,7 @@ pub(crate) fn found_in_words(
     cancel: &CancelToken,
 ) -> Result<String, String> {
     let missing = MissingCalibration::of(dataset).unwrap_or(MissingCalibration::Camera);
-    let found = look_for(missing, dataset, events, cancel).map_err(|e| e.to_string())?;
+    let found = look::what_is_missing(missing, dataset, events, cancel).map_err(|e| e.to_string())?;
     let has_lens = missing == MissingCalibration::Mount;
     match too_uncertain(&found, has_lens) {
         Some(reason) => {
@@ -248,135 +242,6 @@ pub(crate) fn found_in_words(
         }
         None => Ok(report::values(&found)),
     }
-}
-
-/// Finds what is missing: with the lens where that is given.
-fn look_for(
-    missing: MissingCalibration,
-    dataset: &Recording,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<Calibration, Error> {
-    let camera = dataset.rig.camera(dataset.camera).filter(|_| missing == MissingCalibration::Mount);
-    let mount = assumed_mount(dataset);
-    let lens = camera.map(|c| &c.model);
-    let known = KnownCamera { lens, mount: None, assumed_mount: mount.as_ref() };
-    events.stage(STAGE, 0, || look(dataset, &known, events, cancel))
-}
-
-/// Clock and readout of a camera whose lens and place on the IMU are given, and the rotation where that is not the given one. `None` where the recording
-/// does not show them.
-pub(crate) fn of_given_camera(
-    dataset: &Recording,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Option<Calibration> {
-    let camera = dataset.rig.camera(dataset.camera)?;
-    let mount = camera.body_from_camera.rotation;
-    let known = KnownCamera { lens: Some(&camera.model), mount: Some(&mount), assumed_mount: None };
-    let found = look(dataset, &known, events, cancel).ok()?;
-    (too_uncertain(&found, true).is_none() && found.time_offset_secs.is_observable).then_some(found)
-}
-
-/// Follows features through the recording and estimates, by what is known where nothing contradicts it.
-fn look(
-    dataset: &Recording,
-    known: &KnownCamera<'_>,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<Calibration, Error> {
-    let refuse = |reason: &str| Error::NotCalibrated { name: dataset.name.clone(), reason: reason.into() };
-    if dataset.imu.is_empty() {
-        return Err(refuse("it has no gyroscope"));
-    }
-    let (width, height) = size_of(dataset);
-    let mut tracker = FeatureTracker::new(width, height);
-    let (mut log, mut opposite) = (CalibrationLog::default(), CalibrationLog::default());
-    let mut done = 0;
-    for measurement in input::measurements(dataset, true) {
-        if cancel.is_cancelled() || log.is_full() {
-            break;
-        }
-        match measurement {
-            Measurement::Event(SensorEvent::Imu(sample)) => {
-                log.add_gyro(&sample);
-                opposite.add_gyro(&ImuSample { gyro: AngularRate(-sample.gyro.0), ..sample });
-            }
-            Measurement::Event(SensorEvent::Image(frame)) => {
-                let features = tracker.push(frame.time, &frame.image).map_err(|e| refuse(&e.to_string()))?;
-                if let Some(features) = features {
-                    log.add_image(frame.time, features.iter().copied());
-                    opposite.add_image(frame.time, features.into_iter());
-                }
-                done += 1;
-                events.emit(&Event::Progress { stage: STAGE, done, total: 0 });
-            }
-            // The pass that maps reports what cannot be read.
-            Measurement::Event(_) | Measurement::Stamp(_) | Measurement::Unreadable(..) => {}
-        }
-    }
-    let by = |lens| log.calibrate(width, height, &KnownCamera { lens, ..*known });
-    let found = match known.lens.map(|lens| by(Some(lens))) {
-        Some(Ok(found)) if agrees_with_its_lens(&found) => Ok(found),
-        Some(held) => by(None).or(held),
-        None => by(None),
-    };
-    let is_doubtful = match &found {
-        Ok(found) => found.pixel_sigma > DOUBTFUL_PX,
-        Err(failure) => *failure == CalibrationFailure::Unexplained,
-    };
-    let left = found.as_ref().map_or(f64::INFINITY, |found| found.pixel_sigma);
-    if is_doubtful
-        && let Ok(other) = opposite.calibrate(width, height, &KnownCamera::default())
-        && other.pixel_sigma < DOUBTFUL_PX.min(LEFT_BY_THE_RIGHT_SIGNS * left)
-    {
-        return Err(refuse(&format!(
-            "the gyroscope contradicts the images, and with the opposite signs it agrees with them to {:.2} px: its axes are not right-handed, or its \
-             signs are those of turning the other way; turn the sign of the axis, or of all three, in its table",
-            other.pixel_sigma
-        )));
-    }
-    match found {
-        Ok(found) if found.pixel_sigma > UNEXPLAINED_PX => {
-            Err(refuse(reason(CalibrationFailure::Unexplained)))
-        }
-        found => found.map_err(|failure| refuse(reason(failure))),
-    }
-}
-
-/// Whether what was found with a given lens explains the tracks with one near it.
-fn agrees_with_its_lens(found: &Calibration) -> bool {
-    found.off_given_lens.is_some_and(|off| off < MOST_OFF_LENS) && found.pixel_sigma < DOUBTFUL_PX
-}
-
-/// A given lens is not the recording's where the focal length goes this many of its standard deviations away.
-const MOST_OFF_LENS: f64 = 2.0;
-
-/// What a calibration leaves of the tracks, px, above which the gyroscope's signs are doubted: 0.1 to 0.2 in rendered recordings, 0.76 in the same
-/// with one axis or all of them turned.
-const DOUBTFUL_PX: f64 = 0.4;
-/// What a calibration leaves that explains nothing, px: 38 recordings, real and rendered, stabilised and with stamps that scatter, leave 0.10 to 0.39.
-const UNEXPLAINED_PX: f64 = 1.0;
-/// The share of it that the opposite signs leave where these are the right ones: 0.16 in the same recordings. No rotation makes a left-handed
-/// frame of a right-handed one, so that of two signs only one explains turns about several axes. They have to explain the images, too: of a camera that circled
-/// the middle of a room neither did, and the opposite ones left 1.07 px.
-const LEFT_BY_THE_RIGHT_SIGNS: f64 = 0.5;
-
-fn reason(failure: CalibrationFailure) -> &'static str {
-    match failure {
-        CalibrationFailure::TooLittleData => {
-            "fewer than two seconds of images with common features and gyroscope samples"
-        }
-        CalibrationFailure::TooLittleRotation => "the camera turns too little, or about one axis only",
-        _ => "no camera explains the images by the gyroscope's rotations",
-    }
-}
-
-/// The rotation body_from_camera of which a reader knows that cameras of this kind are mounted so.
-fn assumed_mount(dataset: &Recording) -> Option<So3> {
-    let is_assumed = dataset.warnings.iter().any(|w| w.kind == ASSUMED_MOUNT);
-    let camera = dataset.rig.camera(dataset.camera).filter(|_| is_assumed)?;
-    Some(camera.body_from_camera.rotation)
 }
 
 fn size_of(dataset: &Recording) -> (usize, usize) {

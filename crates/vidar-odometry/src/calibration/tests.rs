@@ -181,6 +181,30 @@ fn turning_about_one_axis_calibrates_a_camera_that_is_mounted_as_usual() {
     assert!(found.mount_is_assumed && turn < 0.06, "turned by {turn}");
 }
 
+/// A mount that was measured shows the clock of a body that turns about one axis, and one that is not the recording's is found out.
+#[test]
+fn a_given_mount_is_held_where_it_explains_the_tracks() {
+    let given = |mount: &So3, truth: &Handheld| {
+        let known = KnownCamera { mount: Some(mount), ..KnownCamera::default() };
+        log_of(truth).calibrate(640, 480, &known).unwrap()
+    };
+    let turn = |found: &Calibration, truth: &Handheld| {
+        (truth.body_from_camera.inverse() * found.body_from_camera).angle_rad()
+    };
+    let askew = So3::exp(&Vector3::new(0.01, -0.01, 0.005));
+    let motion = Handheld { main_axis: (1, 0.0), secs: 8.0, turning: 0.5, ..Handheld::draw(2) };
+    let truth = Handheld { pixel_noise: 0.25, outliers: 0.02, ..motion };
+    let found = given(&(truth.body_from_camera * askew), &truth);
+    let clock = found.time_offset_secs;
+    assert!((clock.value - truth.offset_secs).abs() < 3.0 * clock.sigma && clock.sigma < 2e-3, "{clock:?}");
+    assert!(found.mount_is_assumed && turn(&found, &truth) < 0.06, "turned by {}", turn(&found, &truth));
+
+    let truth = Handheld { secs: 8.0, turning: 0.5, ..Handheld::draw(3) };
+    let quarter = So3::from_axis_angle(&Vector3::z(), std::f64::consts::FRAC_PI_2);
+    let found = given(&(truth.body_from_camera * quarter), &truth);
+    assert!(!found.mount_is_assumed && turn(&found, &truth) < 0.03, "turned by {}", turn(&found, &truth));
+}
+
 /// What a given lens is turned into projects as it does.
 #[test]
 fn a_given_lens_projects_as_its_model() {
