@@ -39,7 +39,10 @@ pub(crate) fn settle(
     let is_given = dataset.calibration != CalibrationSource::Recording;
     let mut timing = given.search(if is_given { TimingSearch::Confirm } else { TimingSearch::Settle })?;
     let mut is_clock_known = false;
-    if is_given && (timing.is_corrected || !timing.is_settled) {
+    // The window's own estimate may have left the given clock before an alignment was there.
+    let given_secs = dataset.rig.camera(dataset.camera).map_or(0.0, |c| c.time_offset.as_secs_f64());
+    let is_moved = (timing.time_offset_secs - given_secs).abs() > MIN_OFFSET_SECS;
+    if is_given && (timing.is_corrected || !timing.is_settled || is_moved) {
         match given.calibrated() {
             Some(calibrated) => {
                 timing = calibrated;

@@ -245,10 +245,12 @@ impl Problem<'_> {
         for r in &reduced {
             spread += r.gradient * r.gradient.transpose();
         }
-        // A given lens is one gradient more, as uncertain as it is.
-        for (p, sigma) in self.sigmas().iter().enumerate().take(self.lens.map_or(0, |_| LENS)) {
-            let own = self.lens.map_or(1.0, |given| given.weight) * sigma;
-            spread[(p, p)] += (own / (sigma * sigma)).powi(2);
+        // A given lens is one gradient more, as uncertain as it is: what is multiplied by the factor later is divided by it here.
+        if let Some(given) = &self.lens {
+            let factor = sigma_factor(solution.windows.len(), solution.gyro_noise_ratio());
+            for (p, sigma) in self.sigmas().iter().enumerate().take(LENS) {
+                spread[(p, p)] += (given.weight * sigma / factor / (sigma * sigma)).powi(2);
+            }
         }
         Some([inverse, inverse * spread * inverse])
     }
