@@ -26,7 +26,7 @@ pub const UNKNOWN_LEVER_M: f64 = 0.05;
 
 /// Clock offsets that are known better than this are kept by the odometry, s: a rendered slow phone, found within 0.1 ms,
 /// was lost when the odometry corrected it by 10 ms from a few seconds.
-pub(crate) const SETTLED_OFFSET_SECS: f64 = 0.0015;
+const SETTLED_OFFSET_SECS: f64 = 0.0015;
 /// Largest relative σ of the focal length and σ of the clock offset of a calibration that is used without being asked for. Eleven
 /// rendered recordings of 20 s had 0.3 to 0.5 % and 0.1 to 0.7 ms. The odometry looks for the clock itself within 150 ms; one that went round a room had 62.
 const MAX_FOCAL_SIGMA: f64 = 0.04;

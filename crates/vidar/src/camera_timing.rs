@@ -1,10 +1,10 @@
 //! Clock offset, rolling-shutter readout and rotation of the camera, found in a first pass over the beginning of a recording.
 //!
 //! Consumer recordings state none of them, and stamps that are 40 ms late or rows that take 25 ms make every odometry fail.
-//! The pass stops as soon as it confirms the given values. Where it contradicts them, or tells nothing within ten seconds, clock and readout are found as those
+//! The pass stops as soon as it confirms the given values. Where it contradicts them, or tells nothing within five seconds, clock and readout are found as those
 //! of a recording without calibration are, with lens and mount as given, and where that does not show them, as well as half a minute does.
 
-use crate::calibrate::{self, SETTLED_OFFSET_SECS};
+use crate::calibrate;
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
@@ -38,22 +38,17 @@ pub(crate) fn settle(
     // What was found from the recording is not found once more.
     let is_given = dataset.calibration != CalibrationSource::Recording;
     let mut timing = given.search(if is_given { TimingSearch::Confirm } else { TimingSearch::Settle })?;
-    let mut is_clock_known = false;
     // The window's own estimate may have left the given clock before an alignment was there.
     let given_secs = dataset.rig.camera(dataset.camera).map_or(0.0, |c| c.time_offset.as_secs_f64());
     let is_moved = (timing.time_offset_secs - given_secs).abs() > MIN_OFFSET_SECS;
     if is_given && (timing.is_corrected || !timing.is_settled || is_moved) {
-        match given.calibrated() {
-            Some(calibrated) => {
-                timing = calibrated;
-                is_clock_known = timing.sigmas_secs.is_some_and(|s| s.0 < SETTLED_OFFSET_SECS);
-            }
-            None => timing = given.search(TimingSearch::Settle)?,
-        }
+        timing = match given.calibrated() {
+            Some(calibrated) => calibrated,
+            None => given.search(TimingSearch::Settle)?,
+        };
     }
     // What half a minute shows is not to be given up for what the first seconds show.
     config.odometry.align_timing &= timing.sigmas_secs.is_none();
-    config.odometry.estimate_time_offset &= !is_clock_known;
     if !timing.is_corrected {
         return Ok(None);
     }

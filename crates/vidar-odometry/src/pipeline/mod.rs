@@ -10,6 +10,6 @@ mod time_calibration;
 mod working_size;
 
 pub(crate) use keyframes::public_state;
-pub use odometry::{InputCounts, Odometry, TimingSearch};
+pub use odometry::{InputCounts, Odometry};
 pub use output::{DivergenceSign, Joined, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
-pub use time_calibration::CameraTiming;
+pub use time_calibration::{CameraTiming, TimingSearch};

@@ -38,8 +38,6 @@ mod start;
 mod successor;
 mod timing;
 
-pub use timing::TimingSearch;
-
 /// Images that may wait for IMU measurements of their time.
 const MAX_PENDING: usize = 40;
 

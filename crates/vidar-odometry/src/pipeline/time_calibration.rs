@@ -50,6 +50,15 @@ pub(crate) struct Correction {
     pub body_from_camera: Option<So3>,
 }
 
+/// How long clock, readout and rotation are looked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TimingSearch {
+    /// Until the given values are confirmed or contradicted.
+    Confirm,
+    /// Until what is found is settled.
+    Settle,
+}
+
 /// Clock, readout and rotation of a camera as the odometry uses them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraTiming {

@@ -9,7 +9,7 @@ use crate::error::OdometryError;
 use crate::gyro_alignment::RollingShutter;
 use crate::pipeline::orientation_check::OrientationCheck;
 use crate::pipeline::output::LossReason;
-use crate::pipeline::time_calibration::{CameraTiming, Correction};
+use crate::pipeline::time_calibration::{CameraTiming, Correction, TimingSearch};
 use crate::tracking::tracks_in;
 use nalgebra::Vector3;
 use vidar_core::{CameraId, Duration, FrameId, LieGroup, Rig, SensorEvent, Timestamp};
@@ -21,15 +21,6 @@ const KNOWN_CLOCK_SECS: f64 = 1e-3;
 const TIMING_SECS: f64 = 30.0;
 /// Stretch within which given values are confirmed where they are right, s.
 const CONFIRMING_SECS: f64 = 5.0;
-
-/// How long clock, readout and rotation are looked for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TimingSearch {
-    /// Until the given values are confirmed or contradicted.
-    Confirm,
-    /// Until what is found is settled.
-    Settle,
-}
 
 impl Odometry {
     /// The calibration as estimated on the way: where the camera is on the body, and what to add to image stamps to get
