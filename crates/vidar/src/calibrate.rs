@@ -30,10 +30,12 @@ const SETTLED_OFFSET_SECS: f64 = 0.0015;
 /// Largest relative σ of the focal length and σ of the clock offset of a calibration that is used without being asked for. Eleven
 /// rendered recordings of 20 s had 0.3 to 0.5 % and 0.1 to 0.7 ms. The odometry looks for the clock itself within 150 ms; one that went round a room had 62.
 const MAX_FOCAL_SIGMA: f64 = 0.04;
-/// Largest σ of the mount of a given lens that is used, rad: more is believed of nothing than of axes that are the IMU's (a stabilised phone at 10 Hz, shown to 7°,
-/// never began with those).
-const MAX_ROTATION_SIGMA: f64 = 0.15;
 const MAX_CLOCK_SIGMA_MS: f64 = 100.0;
+/// Largest σ of a found mount that is used with a given lens, rad: the other choice is that the camera's axes are the IMU's, of which nobody said anything (a
+/// stabilised phone at 10 Hz whose mount was found to 7° never began with that).
+const MAX_ROTATION_SIGMA: f64 = 0.15;
+/// A given value that is this many standard deviations from what was found is contradicted.
+pub(crate) const CONTRADICTING_SIGMAS: f64 = 3.0;
 
 /// Warnings of reading that complain of values which nobody gave.
 const OF_A_GUESS: [&str; 6] = [
@@ -164,9 +166,6 @@ fn replaces(found: &Calibration, given: &CameraModel) -> bool {
         || found.radial.iter().any(|k| k.is_observable && is_other(k.value, k.sigma))
 }
 
-/// Standard deviations from which a given lens is contradicted; as `vidar calibrate` reports it.
-const CONTRADICTING_SIGMAS: f64 = 3.0;
-
 /// For a plan, which tracks nothing: the recording as if [`complete`] had found what is missing, with the values that were read or
 /// guessed. Says what is missing.
 pub(crate) fn assume_complete(dataset: &mut Recording) -> Option<MissingCalibration> {
@@ -263,8 +262,8 @@ pub(crate) fn model_of(found: &Calibration, (width, height): (usize, usize)) -> 
 /// well enough for tracks and gyroscope to agree within a few pixels, or the clock not within a tenth of a second's motion.
 fn too_uncertain(found: &Calibration, has_lens: bool) -> Option<String> {
     let clock_ms = 1e3 * found.time_offset_secs.sigma;
-    let is_mount_shown = found.rotation_is_observable
-        || has_lens && found.rotation_sigmas.iter().all(|s| *s < MAX_ROTATION_SIGMA);
+    let is_mount_shown =
+        found.rotation_is_observable || has_lens && found.rotation_sigma() < MAX_ROTATION_SIGMA;
     if !is_mount_shown {
         Some("the camera turns too little to show how it is mounted on the IMU".into())
     } else if let Some(vague) = vague_focal(found).filter(|_| !has_lens) {

@@ -1,10 +1,14 @@
 //! Clock offset, rolling-shutter readout and rotation of the camera, found in a first pass over the beginning of a recording.
 //!
 //! Consumer recordings state none of them, and stamps that are 40 ms late or rows that take 25 ms make every odometry fail.
-//! The pass stops as soon as it confirms the given values. Where it contradicts them, or tells nothing within five seconds, clock and readout are found as those
-//! of a recording without calibration are, with lens and mount as given, and where that does not show them, as well as half a minute does.
+//!
+//! 1. The pass stops as soon as the first five seconds confirm the given values.
+//! 2. Where they contradict them, or tell nothing, the whole recording is calibrated as one without calibration is, with lens and mount held near the given ones.
+//! 3. Where that does not show the clock, the pass goes on for half a minute.
+//!
+//! A recording that was calibrated from itself has step 3 alone.
 
-use crate::calibrate;
+use crate::calibrate::{self, CONTRADICTING_SIGMAS};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
@@ -99,9 +103,8 @@ impl Given<'_> {
         let found_readout_ms =
             if found.readout_secs.is_observable { calibrate::used_readout_ms(&found) } else { 0.0 };
         let readout_ms = settings.readout_ms.unwrap_or(found_readout_ms);
-        let rotation_sigma = found.rotation_sigmas.iter().fold(0.0, |a: f64, s| a.max(*s));
         let turn = (camera.body_from_camera.rotation.inverse() * found.body_from_camera).angle_rad();
-        let is_turned = turn > (CONTRADICTING_SIGMAS * rotation_sigma).max(MIN_ROTATION_RAD);
+        let is_turned = turn > (CONTRADICTING_SIGMAS * found.rotation_sigma()).max(MIN_ROTATION_RAD);
         let mut body_from_camera = camera.body_from_camera;
         if is_turned {
             body_from_camera.rotation = found.body_from_camera;
@@ -117,8 +120,7 @@ impl Given<'_> {
     }
 }
 
-/// Values are corrected where they differ from the given ones by so many standard deviations, and by this much.
-const CONTRADICTING_SIGMAS: f64 = 3.0;
+/// Contradicted values are corrected where they differ from the given ones by this much.
 const MIN_OFFSET_SECS: f64 = 0.002;
 const MIN_ROTATION_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
 

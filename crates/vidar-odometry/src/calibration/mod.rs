@@ -116,6 +116,13 @@ pub struct Calibration {
     pub gyro_noise_ratio: f64,
 }
 
+impl Calibration {
+    /// The largest of [`Self::rotation_sigmas`], rad.
+    pub fn rotation_sigma(&self) -> f64 {
+        self.rotation_sigmas.into_iter().fold(0.0, f64::max)
+    }
+}
+
 /// Feature tracks and gyroscope samples of a recording.
 #[derive(Debug, Default)]
 pub struct CalibrationLog {
@@ -230,8 +237,7 @@ impl CalibrationLog {
             windows: &windows,
             lens: known.lens.and_then(|lens| GivenLens::of(lens, START_READOUT_SECS)),
         };
-        let by_given = known.mount.and_then(|mount| tracks.explained_by_a_given_mount(mount));
-        if let Some(solved) = by_given {
+        if let Some(solved) = known.mount.and_then(|mount| tracks.explained_by_a_given_mount(mount)) {
             return calibration(&tracks, &solved);
         }
         let found = tracks.explained_by_a_lens(None).and_then(|solved| calibration(&tracks, &solved));

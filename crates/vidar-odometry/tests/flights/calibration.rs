@@ -76,7 +76,6 @@ fn a_slow_hand_gives_what_its_standard_deviations_say_or_nothing() {
     }
 }
 
-/// Action cameras: recordings as many as `VIDAR_CALIBRATION_DRAWS` says, a few by default.
 /// A lens that was measured, 0.5 % off, is believed where a hand turns little, and what is found with it is as far off as is said.
 #[test]
 fn a_given_lens_is_believed_as_far_as_it_is_worth() {
@@ -114,6 +113,7 @@ fn a_given_lens_is_believed_as_far_as_it_is_worth() {
     assert!(with < without, "{with} with, {without} without");
 }
 
+/// Action cameras: recordings as many as `VIDAR_CALIBRATION_DRAWS` says, a few by default.
 #[test]
 fn a_fisheye_is_told_from_a_pinhole_and_calibrated() {
     let draws: u64 = std::env::var("VIDAR_CALIBRATION_DRAWS").map_or(4, |d| d.parse().unwrap());

@@ -1,14 +1,11 @@
 //! What was found, in words and as JSON.
 
 use super::yaml::{disagreement, told};
-use super::{CalibrateOutcome, Stated, UNKNOWN_LEVER_M};
+use super::{CONTRADICTING_SIGMAS, CalibrateOutcome, Stated, UNKNOWN_LEVER_M};
 use nalgebra::Vector3;
 use serde_json::{Value, json};
 use vidar_core::{CameraModel, LieGroup};
 use vidar_odometry::calibration::{Calibration, Estimate};
-
-/// Differences from a given value beyond this many standard deviations contradict it.
-const CONTRADICTION_SIGMAS: f64 = 3.0;
 
 /// One sentence for a warning.
 pub(super) fn sentence(found: &Calibration, has_lens: bool) -> String {
@@ -19,7 +16,7 @@ pub(super) fn sentence(found: &Calibration, has_lens: bool) -> String {
 
 /// The values with their standard deviations.
 pub(super) fn values(found: &Calibration) -> String {
-    let sigma = found.rotation_sigmas.iter().fold(0.0, |a: f64, s| a.max(*s)).to_degrees();
+    let sigma = found.rotation_sigma().to_degrees();
     let rotation = match found.rotation_is_observable {
         true if found.mount_is_assumed => {
             format!("rotation against the IMU within {sigma:.1}° (σ) of what is usual for such cameras")
@@ -59,7 +56,7 @@ impl Comparison {
     }
 
     fn contradicts(&self) -> bool {
-        self.sigmas() > CONTRADICTION_SIGMAS
+        self.sigmas() > CONTRADICTING_SIGMAS
     }
 }
 

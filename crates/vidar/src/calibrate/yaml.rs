@@ -38,7 +38,7 @@ impl CalibrateOutcome {
         line(format!("  # {}", told("k2", &k2, 1.0, "", 4)));
         line(format!("  distortion_coeffs: [{:.6}, {:.6}, 0.0, 0.0]", k1.value, k2.value));
         line(format!("  resolution: [{width}, {height}]"));
-        let sigma = c.rotation_sigmas.iter().fold(0.0, |a: f64, s| a.max(*s)).to_degrees();
+        let sigma = c.rotation_sigma().to_degrees();
         let seen = if c.rotation_is_observable { "" } else { ", not observable in this recording" };
         line(format!(
             "  # rotation: sigma {sigma:.2} degrees{seen}; lever arm: not observable, sigma {UNKNOWN_LEVER_M} m"
