@@ -33,7 +33,7 @@ pub use config::{ImuUse, OdometryConfig};
 pub use error::OdometryError;
 pub use pipeline::{
     CameraTiming, DivergenceSign, InputCounts, Joined, LossReason, Odometry, OdometryOutput, Status,
-    TimingSearch, TrackSummary, Tracking,
+    TrackSummary, Tracking,
 };
 pub use relocalization::SavedMap;
 pub use stages::{Stage, StageTimes};

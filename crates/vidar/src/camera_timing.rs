@@ -2,11 +2,10 @@
 //!
 //! Consumer recordings state none of them, and stamps that are 40 ms late or rows that take 25 ms make every odometry fail.
 //!
-//! 1. The pass stops as soon as the first five seconds confirm the given values.
-//! 2. Where they contradict them, or tell nothing, the whole recording is calibrated as one without calibration is, with lens and mount held near the given ones.
-//! 3. Where that does not show the clock, the pass goes on for half a minute.
+//! 1. The recording is calibrated as one without calibration is, with lens and mount held near the given ones.
+//! 2. Where that does not show the clock, an odometry looks for it in the first half minute.
 //!
-//! A recording that was calibrated from itself has step 3 alone.
+//! A recording that was calibrated from itself has step 2 alone.
 
 use crate::calibrate::{self, CONTRADICTING_SIGMAS};
 use crate::config::Config;
@@ -15,7 +14,7 @@ use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
 use vidar_core::{LieGroup, SensorEvent, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
-use vidar_odometry::{CameraTiming, ImuUse, Odometry, TimingSearch};
+use vidar_odometry::{CameraTiming, ImuUse, Odometry};
 
 /// The stage's name in events.
 pub(crate) const STAGE: &str = "camera timing";
@@ -41,16 +40,10 @@ pub(crate) fn settle(
     let given = Given { dataset, config, events, cancel };
     // What was found from the recording is not found once more.
     let is_given = dataset.calibration != CalibrationSource::Recording;
-    let mut timing = given.search(if is_given { TimingSearch::Confirm } else { TimingSearch::Settle })?;
-    // The window's own estimate may have left the given clock before an alignment was there.
-    let given_secs = dataset.rig.camera(dataset.camera).map_or(0.0, |c| c.time_offset.as_secs_f64());
-    let is_moved = (timing.time_offset_secs - given_secs).abs() > MIN_OFFSET_SECS;
-    if is_given && (timing.is_corrected || !timing.is_settled || is_moved) {
-        timing = match given.calibrated() {
-            Some(calibrated) => calibrated,
-            None => given.search(TimingSearch::Settle)?,
-        };
-    }
+    let timing = match is_given.then(|| given.calibrated()).flatten() {
+        Some(timing) => timing,
+        None => given.searched()?,
+    };
     // What half a minute shows is not to be given up for what the first seconds show.
     config.odometry.align_timing &= timing.sigmas_secs.is_none();
     if !timing.is_corrected {
@@ -71,8 +64,8 @@ struct Given<'a> {
 }
 
 impl Given<'_> {
-    /// What an odometry finds from the first seconds.
-    fn search(&self, search: TimingSearch) -> Result<CameraTiming, Error> {
+    /// What an odometry finds in the first half minute.
+    fn searched(&self) -> Result<CameraTiming, Error> {
         let Self { dataset, config, events, cancel } = *self;
         let mut images = 0;
         let sensors = input::measurements(dataset, true).take_while(|_| !cancel.is_cancelled()).filter_map(
@@ -88,7 +81,7 @@ impl Given<'_> {
                 events.emit(&Event::Progress { stage: STAGE, done: images, total: 0 });
             }
         });
-        Ok(Odometry::find_timing(&dataset.rig, dataset.camera, &config.odometry, search, counted)?)
+        Ok(Odometry::find_timing(&dataset.rig, dataset.camera, &config.odometry, counted)?)
     }
 
     /// What the calibration of a recording finds with the given lens and mount.
@@ -115,7 +108,6 @@ impl Given<'_> {
             body_from_camera,
             sigmas_secs: Some((clock.sigma, found.readout_secs.sigma)),
             is_corrected: is_other_clock || is_turned || settings.readout_ms.is_none() && readout_ms > 0.0,
-            is_settled: true,
         })
     }
 }

@@ -38,7 +38,7 @@ use std::path::{Path, PathBuf};
 use vidar_core::{Duration, Health, LieGroup, NavState, Se3, SensorEvent, So3, StampedPose, Timestamp};
 use vidar_dataset::{OpenOptions, Recording};
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
-use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, StageTimes, TimingSearch};
+use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, StageTimes};
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -248,7 +248,7 @@ fn run(dataset: &Recording, options: &Options) -> Result<Run, Failure> {
         true => Odometry::new(&rig, dataset.camera, &config)?,
         false => {
             let events = dataset.events().filter_map(Result::ok);
-            let timing = Odometry::find_timing(&rig, dataset.camera, &config, TimingSearch::Settle, events)?;
+            let timing = Odometry::find_timing(&rig, dataset.camera, &config, events)?;
             if options.verbose {
                 println!("  {timing:?}");
             }

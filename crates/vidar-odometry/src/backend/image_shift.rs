@@ -103,7 +103,7 @@ pub(crate) fn seen_by_turned(
 impl Smoother {
     /// Takes all observations as cameras would make them that are turned as the images are shifted, by the present shifts; how far the farthest moved, px.
     pub(crate) fn turn_shifted_pixels(&mut self) -> f64 {
-        if self.config.image_shift_sigma().is_none() {
+        if !self.shifts_images() {
             return 0.0;
         }
         let mut farthest = 0.0_f64;
@@ -119,6 +119,11 @@ impl Smoother {
             landmark.observations.iter_mut().for_each(&mut turn);
         }
         farthest
+    }
+
+    /// Whether every image has a shift of its own.
+    pub(crate) fn shifts_images(&self) -> bool {
+        self.config.image_shift_sigma().is_some()
     }
 
     /// The body's state of a frame at the present states.
@@ -152,7 +157,7 @@ impl Smoother {
 
     /// Share of the camera's turns that the stabiliser takes back, 0…1: the slope of the shifts over the turns between the window's images. 0 where images are not shifted.
     pub(crate) fn stabilised_share(&self) -> f64 {
-        if self.config.image_shift_sigma().is_none() {
+        if !self.shifts_images() {
             return 0.0;
         }
         // About so much of a turn has to be seen before its share says anything.

@@ -9,6 +9,7 @@ use crate::frontend::{
     Detection, Detector, DetectorConfig, FeatureKind, FrontendError, Pyramid, from_level, sample, to_level,
 };
 use nalgebra::{Matrix2, Vector2};
+use rayon::prelude::*;
 use vidar_core::camera::Pixel;
 use vidar_core::{FrameImage, Image, LandmarkId, Timestamp};
 
@@ -85,23 +86,21 @@ impl FeatureTracker {
     ) -> Result<Option<Vec<(LandmarkId, Pixel)>>, FrontendError> {
         self.newest.rebuild(image)?;
         let (kept, newest, base) = (&self.kept, &self.newest, self.base);
-        self.followed.retain_mut(|f| {
-            let Some(pixel) = follow(kept, newest, &f.anchor, &(f.pixel + f.moved), base)
-                .or_else(|| follow(kept, newest, &f.anchor, &f.pixel, base))
-            else {
-                return false;
-            };
-            (f.moved, f.pixel) = (pixel - f.pixel, pixel);
-            true
+        let found = self.followed.par_iter().map(|f| {
+            let goes_on = follow(kept, newest, &f.anchor, &(f.pixel + f.moved), base);
+            let pixel = goes_on.or_else(|| follow(kept, newest, &f.anchor, &f.pixel, base))?;
+            Some(Followed { moved: pixel - f.pixel, pixel, ..*f })
         });
+        self.followed = found.collect::<Vec<_>>().into_iter().flatten().collect();
         let is_kept = self.kept_time.is_none_or(|t| (stamp - t).as_secs_f64() >= IMAGE_SPACING_SECS);
         if !is_kept {
             return Ok(None);
         }
-        self.followed.retain(|f| {
+        let returns = self.followed.par_iter().filter(|f| {
             let back = follow(newest, kept, &f.pixel, &f.anchor, base);
             back.is_some_and(|b| (b - f.anchor).norm() < MAX_RETURN_PX * (1 << base) as f64)
         });
+        self.followed = returns.copied().collect();
         self.add_corners();
         std::mem::swap(&mut self.kept, &mut self.newest);
         self.followed.iter_mut().for_each(|f| f.anchor = f.pixel);

@@ -259,6 +259,7 @@ impl Initializer {
                 world_from_current,
                 current_from_last: world_from_current.inverse() * world_from_last,
                 has_translation: false,
+                may_be_stabilised: true,
                 last,
                 secs,
             };

@@ -12,4 +12,4 @@ mod working_size;
 pub(crate) use keyframes::public_state;
 pub use odometry::{InputCounts, Odometry};
 pub use output::{DivergenceSign, Joined, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
-pub use time_calibration::{CameraTiming, TimingSearch};
+pub use time_calibration::CameraTiming;

@@ -50,15 +50,6 @@ pub(crate) struct Correction {
     pub body_from_camera: Option<So3>,
 }
 
-/// How long clock, readout and rotation are looked for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum TimingSearch {
-    /// Until the given values are confirmed or contradicted.
-    Confirm,
-    /// Until what is found is settled.
-    Settle,
-}
-
 /// Clock, readout and rotation of a camera as the odometry uses them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraTiming {
@@ -72,8 +63,6 @@ pub struct CameraTiming {
     pub sigmas_secs: Option<(f64, f64)>,
     /// Whether any of them differs from the given one.
     pub is_corrected: bool,
-    /// Whether another look at the recording would bring little.
-    pub is_settled: bool,
 }
 
 impl CameraTiming {
@@ -152,7 +141,6 @@ impl TimeCalibration {
             body_from_camera: camera.body_from_camera,
             sigmas_secs: if is_corrected { Some(self.used_sigmas) } else { self.estimated },
             is_corrected,
-            is_settled: self.is_settled(),
         }
     }
 

@@ -8,11 +8,13 @@
 //!   velocity updates).
 
 mod fixed_parts;
+mod search;
 mod sliding_window;
 pub(crate) mod standstill;
 mod track;
 mod tracker;
 
+pub(crate) use search::{CameraPoses, Prediction};
 pub(crate) use sliding_window::{
     ASSUMED_LANDMARKS, ASSUMED_LOG_STD, FrameInput, SlidingWindowOdometry, StepReport,
 };
@@ -22,4 +24,4 @@ pub(crate) use track::{
     HostImage, ImagePool, Measurer, Track, host_covariance, noisy_covariance, parallax, rotated_pixel,
     unknown_distance,
 };
-pub(crate) use tracker::{CameraPoses, MIN_CORNERS, Prediction, Tracker};
+pub(crate) use tracker::{MIN_CORNERS, Tracker};

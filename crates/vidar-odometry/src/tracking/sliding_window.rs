@@ -7,10 +7,11 @@ mod standstill;
 
 pub(crate) use seeds::{ASSUMED_LANDMARKS, ASSUMED_LOG_STD};
 
+use super::search::{CameraPoses, Prediction};
 use super::standstill::{ImageMotion, tracks_in};
 use super::track::TrackRecord;
 use super::track::{HostImage, Track, noisy_covariance};
-use super::tracker::{CameraPoses, Prediction, TrackCounts, Tracker};
+use super::tracker::{TrackCounts, Tracker};
 use crate::backend::{MarginalisationReport, Observation, OptimiseReport, Smoother, SmootherError};
 use crate::config::OdometryConfig;
 use crate::frontend::{ImageAligner, PixelMeasurement};
@@ -258,6 +259,7 @@ impl SlidingWindowOdometry {
             world_from_current,
             current_from_last: world_from_current.inverse() * world_from_last,
             has_translation: true,
+            may_be_stabilised: self.smoother.shifts_images(),
             last: self.last,
             secs: self.smoother.time(self.last).map_or(0.0, |t| (time - t).as_secs_f64()),
         };

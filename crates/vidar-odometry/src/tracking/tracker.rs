@@ -1,17 +1,13 @@
 //! All tracks of the odometry: predicted, measured, gated, detected, dropped.
 
 use super::fixed_parts::FixedParts;
+use super::search::{self, BORDER_PX, Found, Prediction, is_known};
 use super::track::{HostImage, InverseDistance, Measurer, Track, rotated_pixel, unknown_distance};
-use crate::frontend::{
-    Detection, Detector, DetectorConfig, Feature, MatchFailure, OccupancyGrid, PixelMeasurement, Warp,
-};
+use crate::frontend::{Detection, Detector, DetectorConfig, Feature, MatchFailure, OccupancyGrid};
 use nalgebra::Vector2;
 use std::sync::Arc;
-use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
-
-/// Relative deviation of a distance below which the point's place is predicted from it rather than from its motion.
-const KNOWN_DISTANCE: f64 = 0.3;
+use vidar_solve::statistics::median_upper;
 
 /// Frames in a row without being found after which a track without and with known distance is given up.
 const MAX_MISSED_SEED: u32 = 1;
@@ -19,9 +15,6 @@ const MAX_MISSED_KNOWN: u32 = 3;
 
 /// Observations of a seed that there is room for without asking: as many as a window holds frames.
 const SEEN_FRAMES: usize = 24;
-
-/// Tracks may not come nearer than this to the border of the image, pixels.
-const BORDER_PX: f64 = 8.0;
 
 /// Fewest corners of an image in which tracks begin that are to carry a state.
 pub(crate) const MIN_CORNERS: usize = 40;
@@ -35,12 +28,6 @@ pub(crate) struct TrackCounts {
     pub seeds_found: usize,
 }
 
-/// Where the camera of a frame is.
-pub(crate) trait CameraPoses {
-    /// Pose of the camera of `frame`, or `None` when it is not held.
-    fn world_from_camera(&self, frame: FrameId) -> Option<Se3>;
-}
-
 /// Holds and measures tracks.
 #[derive(Debug)]
 pub(crate) struct Tracker {
@@ -52,20 +39,10 @@ pub(crate) struct Tracker {
     fixed_parts: FixedParts,
     /// Tracks that ended in the newest image because they move with the camera.
     pub fixed: Vec<LandmarkId>,
+    /// Whether fewer than half of the tracks were where the newest image was predicted to show them.
+    is_astray: bool,
     detections: Vec<Detection>,
     next_id: u32,
-}
-
-/// The motion of the camera into the image that is measured, as predicted.
-pub(crate) struct Prediction<'a> {
-    pub poses: &'a dyn CameraPoses,
-    pub world_from_current: Se3,
-    pub current_from_last: Se3,
-    /// Whether translations mean anything.
-    pub has_translation: bool,
-    pub last: FrameId,
-    /// Seconds since it.
-    pub secs: f64,
 }
 
 impl Tracker {
@@ -75,6 +52,7 @@ impl Tracker {
         Self {
             fixed_parts: FixedParts::new(&grid, camera.width()),
             fixed: Vec::new(),
+            is_astray: false,
             camera,
             tracks: Vec::new(),
             measurer: Measurer::new(noise_gray),
@@ -104,22 +82,24 @@ impl Tracker {
     /// shutter at the image's time.
     pub fn measure(&mut self, current: &HostImage, prediction: &Prediction<'_>) -> TrackCounts {
         let frame = current.frame;
+        let (found, is_astray) =
+            search::find_all(&self.camera, &mut self.measurer, &mut self.tracks, current, prediction);
+        self.is_astray = is_astray;
         let mut counts = TrackCounts::default();
-        let (camera, measurer) = (&self.camera, &mut self.measurer);
+        let mut found = found.into_iter();
         self.tracks.retain_mut(|track| {
-            let Some(world_from_host) = prediction.poses.world_from_camera(track.host.frame) else {
+            if prediction.poses.world_from_camera(track.host.frame).is_none() {
+                found.next();
                 return false;
-            };
-            let current_from_host = prediction.world_from_current.inverse() * world_from_host;
-            let found = measure_one(camera, measurer, track, current, &current_from_host, prediction);
+            }
             let (tried, count) = if track.is_landmark {
                 (&mut counts.landmarks_tried, &mut counts.landmarks_found)
             } else {
                 (&mut counts.seeds_tried, &mut counts.seeds_found)
             };
             *tried += 1;
-            match found {
-                Ok((pixel, measurement)) => {
+            match found.next() {
+                Some(Ok(Found { pixel, measurement, .. })) => {
                     *count += 1;
                     track.last_pixel = pixel;
                     track.last_global_pixel = measurement.pixel;
@@ -133,7 +113,7 @@ impl Tracker {
                     track.moved_px = track.moved_px.max((pixel - track.feature.pixel).norm());
                     true
                 }
-                Err(failure) => {
+                failed => {
                     track.measured = None;
                     track.missed += 1;
                     let limit = if is_known(&track.distance, prediction.has_translation) {
@@ -141,7 +121,7 @@ impl Tracker {
                     } else {
                         MAX_MISSED_SEED
                     };
-                    track.missed < limit && failure != MatchFailure::OutsideImage
+                    track.missed < limit && !matches!(failed, Some(Err(MatchFailure::OutsideImage)))
                 }
             }
         });
@@ -196,6 +176,7 @@ impl Tracker {
             self.grid.take(&track.last_pixel);
         }
         self.fixed_parts.take(&mut self.grid, host.frame);
+        let drift = self.common_drift();
         let mut detections = std::mem::take(&mut self.detections);
         self.detector.detect(&host.pyramid, &self.grid, &mut detections);
         let before = self.tracks.len();
@@ -211,10 +192,24 @@ impl Tracker {
                 .and_then(|f| f.with_global_pixel(&self.camera, global_pixel));
             let Some(feature) = feature else { continue };
             let track = self.fresh_track(host, feature, unknown_distance(typical_inverse));
-            self.tracks.push(track);
+            self.tracks.push(Track { drift, ..track });
         }
         self.detections = detections;
         self.tracks.len() - before
+    }
+
+    /// What the predictions of the newest image's tracks were off by in common, pixels per second: a translation past what is near, a stabiliser that takes turns
+    /// back.
+    fn common_drift(&self) -> Vector2<f64> {
+        if !self.is_astray {
+            return Vector2::zeros();
+        }
+        let drifts = |axis: usize| {
+            let measured = self.tracks.iter().filter(|t| t.measured.is_some() && t.drift != Vector2::zeros());
+            let mut values: Vec<f64> = measured.map(|t| t.drift[axis]).collect();
+            median_upper(&mut values).unwrap_or(0.0)
+        };
+        Vector2::new(drifts(0), drifts(1))
     }
 
     fn fresh_track(&mut self, host: &Arc<HostImage>, feature: Feature, distance: InverseDistance) -> Track {
@@ -246,50 +241,12 @@ fn by_turn_px(camera: &CameraModel, track: &Track, current_from_host: &Se3) -> f
     rotated_pixel(camera, began, current_from_host).map_or(0.0, |turned| (turned - began).norm())
 }
 
-fn is_known(distance: &InverseDistance, has_translation: bool) -> bool {
-    has_translation && distance.relative_std() < KNOWN_DISTANCE
-}
-
-/// Where the image shows the track, and the measurement as a global shutter would give it.
-fn measure_one(
-    camera: &CameraModel,
-    measurer: &mut Measurer,
-    track: &mut Track,
-    current: &HostImage,
-    current_from_host: &Se3,
-    prediction: &Prediction<'_>,
-) -> Result<(Pixel, PixelMeasurement), MatchFailure> {
-    let known = is_known(&track.distance, prediction.has_translation);
-    let inverse = if prediction.has_translation { track.distance.mean.max(0.0) } else { 0.0 };
-    let mut warp =
-        Warp::new(camera, &track.feature, inverse, current_from_host).ok_or(MatchFailure::NotVisible)?;
-    let turned = (!known && track.last_frame == prediction.last)
-        .then(|| rotated_pixel(camera, &track.last_global_pixel, &prediction.current_from_last))
-        .flatten();
-    let expected = match turned {
-        Some(turned) => turned + track.drift * prediction.secs,
-        None => warp.pixel,
-    };
-    let expected = current.shutter.add_motion(camera, &expected, inverse);
-    if !camera.contains(&expected, BORDER_PX) {
-        return Err(MatchFailure::OutsideImage);
-    }
-    warp.pixel = expected;
-    let found =
-        measurer.find(&track.host.pyramid, &track.feature, &warp, &expected, &current.pyramid, !known)?;
-    let shown = found.measurement.pixel;
-    let pixel = current.shutter.remove_motion(camera, &shown, inverse);
-    if let Some(turned) = turned {
-        track.drift = (pixel - turned) / prediction.secs.max(1e-3);
-    }
-    Ok((shown, PixelMeasurement { pixel, ..found.measurement }))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::frontend::{Pyramid, testbed};
     use crate::gyro_alignment::RollingShutter;
+    use crate::tracking::CameraPoses;
     use vidar_core::Image;
 
     /// Rows from here on show the carrier.
@@ -322,6 +279,7 @@ mod tests {
             world_from_current: poses.0[view],
             current_from_last: poses.0[view].inverse() * poses.0[view - 1],
             has_translation: false,
+            may_be_stabilised: true,
             last: FrameId(view as u32 - 1),
             secs,
         };

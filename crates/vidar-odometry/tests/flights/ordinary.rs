@@ -7,7 +7,7 @@ use vidar_core::{BodyFrame, Duration, NavState, SensorEvent, StampedPose, Trajec
 use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
-use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput, Status, TimingSearch};
+use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput, Status};
 use vidar_synth::{Lens, SynthConfig, write_sequence};
 
 const READOUT_SECS: f64 = 0.022;
@@ -49,9 +49,7 @@ fn run(dataset: &Recording, mut odometry: Odometry) -> Vec<OdometryOutput> {
 fn clock_and_readout_are_found_and_the_trajectory_is_metric() {
     let (_, dataset) = recording();
     let config = OdometryConfig::default();
-    let timing =
-        Odometry::find_timing(&dataset.rig, dataset.camera, &config, TimingSearch::Settle, events(dataset))
-            .unwrap();
+    let timing = Odometry::find_timing(&dataset.rig, dataset.camera, &config, events(dataset)).unwrap();
     let offset_ms = 1e3 * (timing.time_offset_secs + STAMP_DELAY_SECS);
     let readout_ms = 1e3 * (timing.readout_secs - READOUT_SECS);
     assert!(offset_ms.abs() < 3.0, "clock off by {offset_ms} ms: {timing:?}");

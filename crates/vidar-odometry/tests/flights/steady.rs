@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use vidar_core::{BodyFrame, KeyframeId, LieGroup, Se3, StampedPose, Timestamp, Trajectory};
 use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
-use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput, TimingSearch};
+use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput};
 use vidar_synth::{FlightKind, SceneKind, SynthConfig, write_sequence};
 
 type Stamped = Vec<(Timestamp, Se3)>;
@@ -13,9 +13,7 @@ type Stamped = Vec<(Timestamp, Se3)>;
 fn run(recording: &Recording) -> Vec<OdometryOutput> {
     let events = || recording.events().map(Result::unwrap);
     let config = OdometryConfig::default();
-    let timing =
-        Odometry::find_timing(&recording.rig, recording.camera, &config, TimingSearch::Settle, events())
-            .unwrap();
+    let timing = Odometry::find_timing(&recording.rig, recording.camera, &config, events()).unwrap();
     let mut odometry = Odometry::with_timing(&recording.rig, recording.camera, &config, &timing).unwrap();
     let mut outputs: Vec<OdometryOutput> = events().filter_map(|e| odometry.push(e).unwrap()).collect();
     outputs.extend(odometry.finish());

@@ -9,7 +9,7 @@ use crate::error::OdometryError;
 use crate::gyro_alignment::RollingShutter;
 use crate::pipeline::orientation_check::OrientationCheck;
 use crate::pipeline::output::LossReason;
-use crate::pipeline::time_calibration::{CameraTiming, Correction, TimingSearch};
+use crate::pipeline::time_calibration::{CameraTiming, Correction};
 use crate::tracking::tracks_in;
 use nalgebra::Vector3;
 use vidar_core::{CameraId, Duration, FrameId, LieGroup, Rig, SensorEvent, Timestamp};
@@ -19,8 +19,6 @@ const KNOWN_CLOCK_SECS: f64 = 1e-3;
 
 /// Stretch of a recording from which the camera's timing is found, s: a hand turns often enough within it.
 const TIMING_SECS: f64 = 30.0;
-/// Stretch within which given values are confirmed where they are right, s.
-const CONFIRMING_SECS: f64 = 5.0;
 
 impl Odometry {
     /// The calibration as estimated on the way: where the camera is on the body, and what to add to image stamps to get
@@ -39,8 +37,8 @@ impl Odometry {
         self.time_calibration.timing(&self.camera, offset.as_secs_f64())
     }
 
-    /// Finds clock, readout and rotation of a camera from the beginning of a recording: events are taken until `search` ends,
-    /// for half a minute at most.
+    /// Finds clock, readout and rotation of a camera from the beginning of a recording: events are taken until what is found is
+    /// settled, for half a minute at most.
     ///
     /// # Errors
     /// As [`Odometry::new`] and [`Odometry::push`].
@@ -48,7 +46,6 @@ impl Odometry {
         rig: &Rig,
         camera: CameraId,
         config: &OdometryConfig,
-        search: TimingSearch,
         events: impl IntoIterator<Item = SensorEvent>,
     ) -> Result<CameraTiming, OdometryError> {
         let mut odometry = Self::new(rig, camera, config)?;
@@ -60,11 +57,7 @@ impl Odometry {
             odometry.push(event)?;
             let Some(newest) = odometry.last_image else { continue };
             let seen_secs = (newest - *first.get_or_insert(newest)).as_secs_f64();
-            let is_over = match search {
-                TimingSearch::Confirm => odometry.timing().is_corrected || seen_secs > CONFIRMING_SECS,
-                TimingSearch::Settle => seen_secs > TIMING_SECS,
-            };
-            if is_over || odometry.time_calibration.is_settled() {
+            if seen_secs > TIMING_SECS || odometry.time_calibration.is_settled() {
                 break;
             }
         }
