@@ -39,24 +39,25 @@ pub(crate) struct Prediction<'a> {
     pub secs: f64,
 }
 
-/// Looks for every track; what was found of each, and whether fewer than half were where they were predicted.
+/// Looks for every track and writes into `all` what was found of each; whether fewer than half were where they were predicted.
 pub(super) fn find_all(
     camera: &CameraModel,
     measurer: &mut Measurer,
     tracks: &mut [Track],
     current: &HostImage,
     prediction: &Prediction<'_>,
-) -> (Vec<Result<Found, MatchFailure>>, bool) {
-    let mut all: Vec<Result<Found, MatchFailure>> =
-        tracks.iter().map(|_| Err(MatchFailure::NotVisible)).collect();
+    all: &mut Vec<Result<Found, MatchFailure>>,
+) -> bool {
+    all.clear();
+    all.resize(tracks.len(), Err(MatchFailure::NotVisible));
     let mut search = Search { displaced: Vector2::zeros(), is_wide: false };
     for round in 0..ROUNDS {
-        for (track, found) in tracks.iter_mut().zip(&mut all).filter(|(_, found)| found.is_err()) {
+        for (track, found) in tracks.iter_mut().zip(all.iter_mut()).filter(|(_, found)| found.is_err()) {
             *found = find(camera, measurer, track, current, prediction, search);
         }
         let many = all.iter().flatten().count();
         if !prediction.may_be_stabilised || 2 * many >= all.len() {
-            return (all, round > 0);
+            return round > 0;
         }
         let off = |axis: usize| {
             let mut off: Vec<f64> = all.iter().flatten().map(|found| found.off[axis]).collect();
@@ -64,7 +65,7 @@ pub(super) fn find_all(
         };
         search = Search { displaced: Vector2::new(off(0), off(1)), is_wide: true };
     }
-    (all, true)
+    true
 }
 
 pub(super) fn is_known(distance: &InverseDistance, has_translation: bool) -> bool {
@@ -81,7 +82,7 @@ struct Search {
 }
 
 /// A track in an image.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Found {
     /// Where the image shows it.
     pub pixel: Pixel,

@@ -41,6 +41,7 @@ pub(crate) struct Tracker {
     pub fixed: Vec<LandmarkId>,
     /// Whether fewer than half of the tracks were where the newest image was predicted to show them.
     is_astray: bool,
+    found: Vec<Result<Found, MatchFailure>>,
     detections: Vec<Detection>,
     next_id: u32,
 }
@@ -53,6 +54,7 @@ impl Tracker {
             fixed_parts: FixedParts::new(&grid, camera.width()),
             fixed: Vec::new(),
             is_astray: false,
+            found: Vec::new(),
             camera,
             tracks: Vec::new(),
             measurer: Measurer::new(noise_gray),
@@ -82,11 +84,11 @@ impl Tracker {
     /// shutter at the image's time.
     pub fn measure(&mut self, current: &HostImage, prediction: &Prediction<'_>) -> TrackCounts {
         let frame = current.frame;
-        let (found, is_astray) =
-            search::find_all(&self.camera, &mut self.measurer, &mut self.tracks, current, prediction);
-        self.is_astray = is_astray;
+        let (tracks, found) = (&mut self.tracks, &mut self.found);
+        self.is_astray =
+            search::find_all(&self.camera, &mut self.measurer, tracks, current, prediction, found);
         let mut counts = TrackCounts::default();
-        let mut found = found.into_iter();
+        let mut found = self.found.iter();
         self.tracks.retain_mut(|track| {
             if prediction.poses.world_from_camera(track.host.frame).is_none() {
                 found.next();
@@ -99,7 +101,7 @@ impl Tracker {
             };
             *tried += 1;
             match found.next() {
-                Some(Ok(Found { pixel, measurement, .. })) => {
+                Some(&Ok(Found { pixel, measurement, .. })) => {
                     *count += 1;
                     track.last_pixel = pixel;
                     track.last_global_pixel = measurement.pixel;
