@@ -300,32 +300,42 @@ fn arm_doubt(input: &AdjustmentInput<'_>, problem: &Problem) -> f64 {
     let found = problem.calibration.body_from_camera.translation;
     let is_assumed = input.sigmas.position_m > ASSUMED_POSITION_M;
     let given = if is_assumed { Vector3::zeros() } else { input.given_body_from_camera.translation };
-    let places: Vec<Vector3<f64>> =
-        problem.frames.iter().map(|f| f.body.state.world_from_body.translation).collect();
-    doubt_of(&(found - given), &places)
+    doubt_of(&(found - given), &places(problem))
+}
+
+/// Where the body was.
+fn places(problem: &Problem) -> Vec<Vector3<f64>> {
+    problem.frames.iter().map(|f| f.body.state.world_from_body.translation).collect()
+}
+
+/// From their mean to places.
+fn about_their_mean(places: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
+    let mean = places.iter().sum::<Vector3<f64>>() / places.len() as f64;
+    places.iter().map(|p| p - mean).collect()
+}
+
+fn sum_of_squares(vectors: &[Vector3<f64>]) -> f64 {
+    vectors.iter().map(Vector3::norm_squared).sum()
 }
 
 /// The length of `arm` over how far `places` lie from their mean (root mean square) where that is more than 1, else 0.
 fn doubt_of(arm: &Vector3<f64>, places: &[Vector3<f64>]) -> f64 {
-    let mean = places.iter().sum::<Vector3<f64>>() / places.len().max(1) as f64;
-    let square = places.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / places.len().max(1) as f64;
-    let ratio = arm.norm() / square.sqrt();
+    let spread = (sum_of_squares(&about_their_mean(places)) / places.len() as f64).sqrt();
+    let ratio = arm.norm() / spread;
     if ratio > 1.0 { ratio } else { 0.0 }
 }
 
 /// With positions `p_k` about their mean `m`, `d ln s / d p_k = (p_k − m) / Σ |p − m|²`.
 pub(super) fn log_scale_sigma(problem: &Problem, system: &System) -> f64 {
-    let places: Vec<Vector3<f64>> =
-        problem.frames.iter().map(|f| f.body.state.world_from_body.translation).collect();
-    let mean = places.iter().sum::<Vector3<f64>>() / places.len() as f64;
-    let spread: f64 = places.iter().map(|p| (p - mean).norm_squared()).sum();
+    let places = about_their_mean(&places(problem));
+    let spread = sum_of_squares(&places);
     if !(spread > 0.0) {
         return f64::INFINITY;
     }
     let mut slope = vec![0.0; problem.dim()];
     for (k, place) in places.iter().enumerate() {
         let at = problem.offset(k) + 3;
-        slope[at..at + 3].copy_from_slice(((place - mean) / spread).as_slice());
+        slope[at..at + 3].copy_from_slice((place / spread).as_slice());
     }
     system.sigma_of(slope)
 }

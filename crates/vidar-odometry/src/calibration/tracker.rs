@@ -86,12 +86,12 @@ impl FeatureTracker {
     ) -> Result<Option<Vec<(LandmarkId, Pixel)>>, FrontendError> {
         self.newest.rebuild(image)?;
         let (kept, newest, base) = (&self.kept, &self.newest, self.base);
-        let found = self.followed.par_iter().map(|f| {
+        let found = self.followed.par_iter().filter_map(|f| {
             let goes_on = follow(kept, newest, &f.anchor, &(f.pixel + f.moved), base);
             let pixel = goes_on.or_else(|| follow(kept, newest, &f.anchor, &f.pixel, base))?;
             Some(Followed { moved: pixel - f.pixel, pixel, ..*f })
         });
-        self.followed = found.collect::<Vec<_>>().into_iter().flatten().collect();
+        self.followed = found.collect();
         let is_kept = self.kept_time.is_none_or(|t| (stamp - t).as_secs_f64() >= IMAGE_SPACING_SECS);
         if !is_kept {
             return Ok(None);

@@ -59,13 +59,16 @@ pub(super) fn find_all(
         if !prediction.may_be_stabilised || 2 * many >= all.len() {
             return round > 0;
         }
-        let off = |axis: usize| {
-            let mut off: Vec<f64> = all.iter().flatten().map(|found| found.off[axis]).collect();
-            median_upper(&mut off).filter(|_| many >= LEAST_COMMON).unwrap_or(0.0)
-        };
-        search = Search { displaced: Vector2::new(off(0), off(1)), is_wide: true };
+        let common = median(all.iter().flatten().map(|found| found.off)).filter(|_| many >= LEAST_COMMON);
+        search = Search { displaced: common.unwrap_or_default(), is_wide: true };
     }
     true
+}
+
+/// The median of each coordinate.
+pub(super) fn median(vectors: impl Iterator<Item = Vector2<f64>>) -> Option<Vector2<f64>> {
+    let (mut x, mut y): (Vec<f64>, Vec<f64>) = vectors.map(|v| (v.x, v.y)).unzip();
+    Some(Vector2::new(median_upper(&mut x)?, median_upper(&mut y)?))
 }
 
 pub(super) fn is_known(distance: &InverseDistance, has_translation: bool) -> bool {

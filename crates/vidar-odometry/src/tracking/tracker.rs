@@ -7,7 +7,6 @@ use crate::frontend::{Detection, Detector, DetectorConfig, Feature, MatchFailure
 use nalgebra::Vector2;
 use std::sync::Arc;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
-use vidar_solve::statistics::median_upper;
 
 /// Frames in a row without being found after which a track without and with known distance is given up.
 const MAX_MISSED_SEED: u32 = 1;
@@ -206,12 +205,8 @@ impl Tracker {
         if !self.is_astray {
             return Vector2::zeros();
         }
-        let drifts = |axis: usize| {
-            let measured = self.tracks.iter().filter(|t| t.measured.is_some() && t.drift != Vector2::zeros());
-            let mut values: Vec<f64> = measured.map(|t| t.drift[axis]).collect();
-            median_upper(&mut values).unwrap_or(0.0)
-        };
-        Vector2::new(drifts(0), drifts(1))
+        let measured = self.tracks.iter().filter(|t| t.measured.is_some() && t.drift != Vector2::zeros());
+        search::median(measured.map(|t| t.drift)).unwrap_or_default()
     }
 
     fn fresh_track(&mut self, host: &Arc<HostImage>, feature: Feature, distance: InverseDistance) -> Track {
