@@ -3,9 +3,9 @@
 use super::hand_eye::BASIN_SECS;
 use super::parameters::{DIM, GivenLens, LENS, OFFSET, Parameters, ROTATION, Tangent, prior_sigmas};
 use super::path::GyroPath;
-use super::window::{Noise, Reduced, Window};
+use super::window::{Noise, Reduced, Turns, Window, shift_sigma};
 use crate::gyro_alignment::RateSample;
-use nalgebra::SMatrix;
+use nalgebra::{SMatrix, Vector3};
 use rayon::prelude::*;
 use std::convert::Infallible;
 use vidar_core::LieGroup;
@@ -70,7 +70,7 @@ pub(super) struct Problem<'a> {
     pub lens: Option<GivenLens>,
     /// Standard deviation of the mount about the prior's, rad, where it is believed at all.
     pub mount_sigma: Option<f64>,
-    pub gyro_noise: f64,
+    pub turns: Turns,
     /// Solutions whose scores differ by less explain the recording equally well.
     pub margin: f64,
 }
@@ -130,7 +130,7 @@ impl Problem<'_> {
         for window in &mut windows {
             window.restart(start, &self.path(start));
         }
-        let noise = Noise { pixel: PIXEL_SIGMA.1, gyro: self.gyro_noise };
+        let noise = Noise { pixel: PIXEL_SIGMA.1, turns: self.turns };
         let at =
             Solution { parameters: *start, windows, cost: f64::INFINITY, noise, spread: Tangent::zeros() };
         let mut refinement = Refinement { problem: self, at, is_clock_held: true };
@@ -145,6 +145,13 @@ impl Problem<'_> {
             let scale =
                 residual_scale(&at.windows, &at.parameters, &path)?.clamp(PIXEL_SIGMA.0, PIXEL_SIGMA.1);
             at.noise.pixel = if round == 0 { (2.0 * scale).max(1.0) } else { scale };
+            if self.turns.is_stabilised() {
+                // Shakes depend on the clock, which settles.
+                at.windows.iter_mut().for_each(|window| window.find_shakes(&at.parameters, &path));
+                if round > 0 {
+                    at.noise.turns = Turns::Stabilised(shift_sigma(&at.windows, &at.noise.turns));
+                }
+            }
             at.cost = self.cost(&at.parameters, &at.windows, &at.noise);
             let cost = at.cost;
             let Ok(report) = minimise(&mut refinement, cost, &schedule, &limits);
@@ -286,24 +293,35 @@ impl LeastSquares for Refinement<'_> {
 }
 
 impl Solution {
-    /// How many times the gyroscope's noise images turn otherwise than it says; 1 where that is nothing but noise.
+    /// How many times the gyroscope's noise images turn otherwise than it says; 1 where that is nothing but noise, or explained as a stabiliser's.
     pub fn gyro_noise_ratio(&self) -> f64 {
-        let pairs = self.windows.iter().flat_map(|window| window.nodes.windows(2));
-        let squares = pairs.map(|pair| {
-            let secs = (pair[1].secs - pair[0].secs).max(1e-3);
-            (pair[1].drift - pair[0].drift).norm_squared() / (3.0 * self.noise.gyro * self.noise.gyro * secs)
-        });
+        if self.noise.turns.is_stabilised() {
+            return 1.0;
+        }
+        let squares = self.off_turns().map(|(off, sigma)| off.norm_squared() / (3.0 * sigma * sigma));
         let (count, sum) = squares.fold((0, 0.0), |(count, sum), square| (count + 1, sum + square));
         let chi2: f64 = sum / f64::from(count.max(1));
         if chi2 > MAX_DRIFT_CHI2 { chi2.sqrt() } else { 1.0 }
     }
 
-    /// Solutions of the same stretches compare by this: the cost grows as the assumed noise shrinks, so the logarithm of the
-    /// noise is a part of it.
+    /// How far a stabiliser moves the images (root mean square of each axis, rad), where there is one.
+    pub fn image_shift_rad(&self) -> Option<f64> {
+        let nodes = self.windows.iter().flat_map(|window| &window.nodes);
+        let (count, sum) = nodes.fold((0, 0.0), |(n, sum), node| (n + 3, sum + node.drift.norm_squared()));
+        self.noise.turns.is_stabilised().then(|| (sum / f64::from(count.max(1))).sqrt())
+    }
+
+    /// Solutions of the same stretches compare by this: the cost grows as the assumed noise shrinks, so the logarithms of the
+    /// standard deviations are a part of it.
     pub fn score(&self) -> f64 {
         let observations: usize =
             self.windows.iter().flat_map(|w| &w.points).map(|p| p.observations.len()).sum();
-        self.cost + 2.0 * observations as f64 * self.noise.pixel.ln()
+        let turns: f64 = self.off_turns().map(|(_, sigma)| 3.0 * sigma.ln()).sum();
+        self.cost + 2.0 * observations as f64 * self.noise.pixel.ln() + turns
+    }
+
+    fn off_turns(&self) -> impl Iterator<Item = (Vector3<f64>, f64)> {
+        self.windows.iter().flat_map(|window| window.off_turns(&self.noise.turns))
     }
 }
 

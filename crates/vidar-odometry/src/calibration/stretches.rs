@@ -2,7 +2,7 @@
 
 use super::parameters::Parameters;
 use super::path::GyroPath;
-use super::window::{Node, NodeObservation, Point, Window};
+use super::window::{Node, NodeObservation, Point, Shakes, Window};
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
 use rustc_hash::FxHashMap;
@@ -99,11 +99,12 @@ fn stretch(size: (f64, f64), images: &[ImageFeatures]) -> Option<Window> {
             observations: std::mem::take(&mut tracks[k].1),
         })
         .collect();
-    let nodes = images
+    let nodes: Vec<Node> = images
         .iter()
         .map(|i| Node { secs: i.secs, drift: Vector3::zeros(), position: Vector3::zeros() })
         .collect();
-    (points.len() >= MIN_POINTS).then_some(Window { nodes, points, reference: images.len() / 2 })
+    let (reference, shakes) = (nodes.len() / 2, Shakes::none(nodes.len()));
+    (points.len() >= MIN_POINTS).then_some(Window { nodes, points, reference, shakes })
 }
 
 impl Window {
@@ -118,6 +119,7 @@ impl Window {
         for node in &mut self.nodes {
             (node.drift, node.position) = (Vector3::zeros(), Vector3::zeros());
         }
+        self.shakes = Shakes::none(self.nodes.len());
         let at = |secs: f64| path.at(secs + parameters.offset_secs).rotation;
         let reference_from_first = at(self.nodes[self.reference].secs).transpose();
         for point in &mut self.points {

@@ -2,7 +2,7 @@
 
 use super::parameters::{DIM, Parameters, Tangent};
 use super::path::GyroPath;
-use super::window::{Node, NodeObservation, Noise, Point, Window};
+use super::window::{Node, NodeObservation, Noise, Point, Shakes, Turns, Window};
 use super::*;
 use crate::simulate::{Handheld, Random};
 use nalgebra::Vector2;
@@ -29,7 +29,7 @@ fn small() -> (Window, Parameters, Vec<RateSample>) {
             RateSample { secs: t, rate: Vector3::new((3.0 * t).sin(), 0.8, (2.0 * t).cos()) }
         })
         .collect();
-    let nodes = (0..4)
+    let nodes: Vec<Node> = (0..4)
         .map(|k| Node {
             secs: 0.3 + 0.1 * f64::from(k),
             drift: r.normal3() * 1e-3,
@@ -61,54 +61,67 @@ fn small() -> (Window, Parameters, Vec<RateSample>) {
         bias: Vector3::new(0.01, 0.02, -0.01),
         scale: Vector3::new(0.01, -0.01, 0.02),
     };
-    (Window { nodes, points, reference: 2 }, parameters, samples)
+    let shakes = Shakes::none(nodes.len());
+    (Window { nodes, points, reference: 2, shakes }, parameters, samples)
 }
+
+/// Both kinds of turns, and the stretch with the shakes of the second.
+fn turned(turns: Turns) -> (Window, Parameters, Vec<RateSample>, Noise) {
+    let (mut window, parameters, samples) = small();
+    if turns.is_stabilised() {
+        window.find_shakes(&parameters, &GyroPath::new(&samples, &parameters.bias, &parameters.scale));
+    }
+    (window, parameters, samples, Noise { pixel: 40.0, turns })
+}
+
+const TURNS: [Turns; 2] = [Turns::Gyroscope(1e-3), Turns::STABILISED];
 
 #[test]
 fn the_gradient_of_the_parameters_is_that_of_the_cost() {
-    let (mut window, parameters, samples) = small();
-    let noise = Noise { pixel: 40.0, gyro: 1e-3 };
-    let cost =
-        |window: &Window, p: &Parameters| window.cost(p, &GyroPath::new(&samples, &p.bias, &p.scale), &noise);
-    // At the optimum of everything else, the reduced gradient is the derivative of the cost by the parameters alone.
-    for _ in 0..60 {
-        let path = GyroPath::new(&samples, &parameters.bias, &parameters.scale);
-        let reduced = window.reduce(&parameters, &path, &noise, 1e-9).unwrap();
-        window.step(&reduced, &Tangent::zeros());
-    }
-    let path = GyroPath::new(&samples, &parameters.bias, &parameters.scale);
-    let reduced = window.reduce(&parameters, &path, &noise, 0.0).unwrap();
-    for p in 0..DIM {
-        let mut step = Tangent::zeros();
-        // Pixels, and numbers of order one.
-        let h = if (3..5).contains(&p) { 1e-3 } else { 1e-6 };
-        step[p] = h;
-        let slope =
-            (cost(&window, &parameters.plus(&step)) - cost(&window, &parameters.plus(&-step))) / (2.0 * h);
-        let expected = -reduced.gradient[p];
-        assert!(
-            (slope - expected).abs() < 2e-3 * expected.abs().max(0.05),
-            "{p}: {slope} instead of {expected}"
-        );
+    // A shift's axes turn with clock and mount, which is left out: of second order in the shift.
+    for (turns, tolerance) in TURNS.into_iter().zip([2e-3, 5e-2]) {
+        let (mut window, parameters, samples, noise) = turned(turns);
+        let path = |p: &Parameters| GyroPath::new(&samples, &p.bias, &p.scale);
+        let cost = |window: &Window, p: &Parameters| window.cost(p, &path(p), &noise);
+        // At the optimum of everything else, the reduced gradient is the derivative of the cost by the parameters alone.
+        for _ in 0..60 {
+            let reduced = window.reduce(&parameters, &path(&parameters), &noise, 1e-9).unwrap();
+            window.step(&reduced, &Tangent::zeros());
+        }
+        let reduced = window.reduce(&parameters, &path(&parameters), &noise, 0.0).unwrap();
+        for p in 0..DIM {
+            let mut step = Tangent::zeros();
+            // Pixels, and numbers of order one.
+            let h = if (3..5).contains(&p) { 1e-3 } else { 1e-6 };
+            step[p] = h;
+            let slope = (cost(&window, &parameters.plus(&step)) - cost(&window, &parameters.plus(&-step)))
+                / (2.0 * h);
+            let expected = -reduced.gradient[p];
+            assert!(
+                (slope - expected).abs() < tolerance * expected.abs().max(0.05),
+                "{turns:?}, {p}: {slope} instead of {expected}"
+            );
+        }
     }
 }
 
 #[test]
 fn steps_of_nodes_and_points_descend_to_the_optimum() {
-    let (mut window, parameters, samples) = small();
-    let noise = Noise { pixel: 40.0, gyro: 1e-3 };
-    let path = GyroPath::new(&samples, &parameters.bias, &parameters.scale);
-    let mut costs = Vec::new();
-    for _ in 0..30 {
-        let reduced = window.reduce(&parameters, &path, &noise, 1e-9).unwrap();
-        costs.push(window.cost(&parameters, &path, &noise));
-        window.step(&reduced, &Tangent::zeros());
+    for turns in TURNS {
+        let (mut window, parameters, samples, noise) = turned(turns);
+        let path = GyroPath::new(&samples, &parameters.bias, &parameters.scale);
+        let mut costs = Vec::new();
+        for _ in 0..30 {
+            let reduced = window.reduce(&parameters, &path, &noise, 1e-9).unwrap();
+            costs.push(window.cost(&parameters, &path, &noise));
+            window.step(&reduced, &Tangent::zeros());
+        }
+        let last = costs.len() - 1;
+        assert!(
+            costs[last] < costs[0] && (costs[last] - costs[last - 1]).abs() < 1e-6 * costs[last],
+            "{turns:?}: {costs:?}"
+        );
     }
-    let last = costs.len() - 1;
-    assert!(
-        costs[last] < costs[0] && (costs[last] - costs[last - 1]).abs() < 1e-6 * costs[last],
-        "{costs:?}"
-    );
 }
 
 #[test]

@@ -5,7 +5,7 @@ use super::lens::LensModel;
 use super::parameters::{FOCAL, GivenLens, Parameters};
 use super::path::GyroPath;
 use super::solve::{Problem, Solution};
-use super::window::Window;
+use super::window::{Turns, Window};
 use super::{CalibrationFailure, START_READOUT_SECS};
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
@@ -32,6 +32,8 @@ const REFINED_MOUNTS: usize = 3;
 /// Starts of an assumed mount that are refined.
 const STARTS_OF_A_MOUNT: usize = 3;
 
+/// By how much a stabiliser may have shortened the focal length: a picture that moves half as far as the camera turns looks like half of it.
+const SHORTENED: [f64; 3] = [1.0, 1.25, 1.6];
 /// Focal length of a usual camera, image widths.
 const USUAL_FOCAL: f64 = 0.75;
 
@@ -118,6 +120,15 @@ impl<'a> Tracks<'a> {
         if is_told { Ok(best) } else { Err(CalibrationFailure::TooLittleRotation) }
     }
 
+    /// A camera with a stabiliser, where one explains the tracks better than what was `found` without.
+    pub fn explained_by_a_stabiliser(&self, (problem, found): &Solved<'a>) -> Option<Solved<'a>> {
+        let problem = Problem { turns: Turns::STABILISED, ..*problem };
+        let lenses =
+            SHORTENED.map(|times| Parameters { focal: times * found.parameters.focal, ..found.parameters });
+        let solution = problem.solve(&lenses, self.windows)?;
+        (solution.score() < found.score() - self.margin()).then_some((problem, solution))
+    }
+
     fn margin(&self) -> f64 {
         let points = self.windows.iter().flat_map(|w| &w.points);
         MARGIN * points.map(|p| p.observations.len()).sum::<usize>() as f64
@@ -157,7 +168,7 @@ impl<'a> Tracks<'a> {
             prior,
             lens: self.lens,
             mount_sigma: mount.map(|_| MOUNT_SIGMA),
-            gyro_noise: self.gyro_noise,
+            turns: Turns::Gyroscope(self.gyro_noise),
             margin: self.margin(),
         };
         let solution = problem.solve(starts, self.windows)?;

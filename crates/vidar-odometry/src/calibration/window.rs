@@ -3,22 +3,26 @@
 //! The gyroscope gives the rotation at the exposure time of every row; positions of the camera at the images' times and
 //! points (direction and inverse distance from the stretch's reference position) are free, because the translation of a hand
 //! that turns looks like a wrong focal length to any two views: only the structure of the scene tells them apart. Errors of
-//! the integrated gyroscope are estimated as a random walk of small rotations. Positions between images are interpolated by
-//! a parabola through the three nearest. Points and then images are eliminated by Schur complements.
+//! the integrated gyroscope are estimated as a random walk of small rotations, or what a stabiliser does as one of each image
+//! ([`Turns`]). Positions between images are interpolated by a parabola through the three nearest. Points and then images are
+//! eliminated by Schur complements.
 
 mod elimination;
+mod turns;
 
-use super::parameters::{DIM, Parameters, Tangent};
+use super::parameters::{DIM, Parameters, Projection, Tangent};
 use super::path::{GyroPath, PathPoint};
 use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, Vector2, Vector3};
+use turns::SHAKES;
+pub(super) use turns::{Shakes, Turns, shift_sigma};
 use vidar_core::camera::Pixel;
 use vidar_core::{LieGroup, So3};
 use vidar_solve::Kernel;
 
 /// Unknowns of an image: rotation by which the gyroscope's is wrong, position.
 const NODE: usize = 6;
-/// Columns of one observation: its image's rotation, three positions, the parameters.
-const TOUCHED: usize = 3 + 9 + DIM;
+/// Columns of one observation: its image's rotation, three positions, the parameters, the shares of a stabiliser.
+const TOUCHED: usize = 3 + 9 + DIM + SHAKES;
 
 /// Residuals beyond this many standard deviations lose weight.
 const KERNEL: Kernel = Kernel::Cauchy { k: 2.0 };
@@ -63,8 +67,8 @@ pub(super) struct Node {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Noise {
     pub pixel: f64,
-    /// Gyroscope white noise, rad/s/√Hz.
-    pub gyro: f64,
+    /// Of the images' rotations.
+    pub turns: Turns,
 }
 
 /// A stretch.
@@ -74,6 +78,8 @@ pub(super) struct Window {
     pub points: Vec<Point>,
     /// The image whose frame is the stretch's.
     pub reference: usize,
+    /// What a stabiliser may take back of the turns.
+    pub shakes: Shakes,
 }
 
 /// What is left for the parameters once a stretch's own unknowns are eliminated: `H δ = g`.
@@ -106,8 +112,22 @@ struct Seen {
     ray: Vector3<f64>,
     in_camera: Vector3<f64>,
     path: PathPoint,
+    /// Rotation by which the gyroscope's is wrong.
+    drift: Matrix3<f64>,
+    /// Time of its row after its image's, s.
+    late: f64,
+    focal: f64,
+    /// By how much a stabiliser moves the picture, pixels.
+    shift: Vector2<f64>,
     position: Vector3<f64>,
     near: [(usize, f64, f64); 3],
+}
+
+impl Seen {
+    /// Where it shows in the picture.
+    fn shown(&self, projection: &Projection) -> Pixel {
+        projection.pixel + self.shift
+    }
 }
 
 impl Window {
@@ -118,9 +138,9 @@ impl Window {
         for point in &self.points {
             for seen in &point.observations {
                 let at = self.see(point, seen, parameters, path, &reference);
-                let e2 = parameters
-                    .project(&at.in_camera)
-                    .map_or(INVALID * INVALID, |p| ((seen.pixel - p.pixel) / noise.pixel).norm_squared());
+                let e2 = parameters.project(&at.in_camera).map_or(INVALID * INVALID, |p| {
+                    ((seen.pixel - at.shown(&p)) / noise.pixel).norm_squared()
+                });
                 cost += KERNEL.loss(e2);
             }
         }
@@ -133,7 +153,7 @@ impl Window {
         let all = self.points.iter().flat_map(|p| p.observations.iter().map(move |o| (p, o)));
         all.filter_map(|(point, seen)| {
             let at = self.see(point, seen, parameters, path, &reference);
-            Some(seen.pixel - parameters.project(&at.in_camera)?.pixel)
+            Some(seen.pixel - at.shown(&parameters.project(&at.in_camera)?))
         })
         .collect()
     }
@@ -150,13 +170,20 @@ impl Window {
         let late = seen.row * parameters.readout_secs;
         let at = path.at(node.secs + parameters.offset_secs + late);
         let body_from_camera = parameters.body_from_camera.matrix();
-        let reference_from_body =
-            So3::exp(&node.drift).matrix() * reference.rotation.transpose() * at.rotation;
-        let turn = (reference_from_body * body_from_camera).transpose();
+        let reference_from_body = reference.rotation.transpose() * at.rotation;
+        let [turns, shifts] = self.shakes.parts(
+            &(node.drift - self.shakes.taken_back(seen.node, late)),
+            &(reference_from_body * body_from_camera),
+        );
+        let drift = So3::exp(&turns).matrix();
+        let turn = (drift * reference_from_body * body_from_camera).transpose();
+        // Turned about the camera's x a camera would see things move down, about its y to the left.
+        let moved = turn * shifts;
+        let (focal, shift) = (parameters.focal, Vector2::new(-moved.y, moved.x) * parameters.focal);
         let near = self.interpolation(seen.node, late);
         let position = near.iter().map(|(k, w, _)| self.nodes[*k].position * *w).sum();
         let ray = point.direction - position * point.inverse_distance;
-        Seen { turn, ray, in_camera: turn * ray, path: at, position, near }
+        Seen { turn, ray, in_camera: turn * ray, path: at, drift, late, focal, shift, position, near }
     }
 
     /// Nodes, weights and their derivatives by time of the position `late` after a node: Lagrange's parabola.
@@ -173,9 +200,9 @@ impl Window {
         [(at[0], wa.0, wa.1), (at[1], wb.0, wb.1), (at[2], wc.0, wc.1)]
     }
 
-    /// The walk's standard deviation from a node to the next, rad.
-    fn walk_sigma(&self, k: usize, noise: &Noise) -> f64 {
-        noise.gyro * (self.nodes[k + 1].secs - self.nodes[k].secs).max(1e-3).sqrt()
+    /// Unknowns that are eliminated with the images.
+    fn own_unknowns(&self) -> usize {
+        NODE * self.nodes.len() + SHAKES
     }
 
     fn prior_cost(&self, noise: &Noise) -> f64 {
@@ -183,18 +210,11 @@ impl Window {
         for (k, node) in self.nodes.iter().enumerate() {
             let sigma = if k == self.reference { FIXED } else { POSITION_PRIOR };
             sum += node.position.norm_squared() / (sigma * sigma);
-            if k == self.reference {
-                sum += node.drift.norm_squared() / (FIXED * FIXED);
-            }
-            if let Some(next) = self.nodes.get(k + 1) {
-                let sigma = self.walk_sigma(k, noise);
-                sum += (next.drift - node.drift).norm_squared() / (sigma * sigma);
-            }
         }
         for point in &self.points {
             let off = (point.inverse_distance - 1.0) / INVERSE_DISTANCE_PRIOR;
             sum += off * off;
         }
-        0.5 * sum
+        0.5 * (sum + self.turns_chi2(&noise.turns))
     }
 }

@@ -15,6 +15,10 @@ const FEATURES: usize = 160;
 const IMAGE_SECS: f64 = 0.1;
 /// Gyroscope samples a second.
 const GYRO_HZ: f64 = 200.0;
+/// A stabiliser takes back what is faster than about this, s.
+const STABILISED_SECS: f64 = 0.7;
+/// And by so much at most, rad.
+const STABILISED_RAD: f64 = 0.02;
 
 /// What is true of one recording.
 #[derive(Clone, Debug)]
@@ -53,6 +57,8 @@ pub struct Handheld {
     pub main_axis: (usize, f64),
     /// Root mean square of the velocity, m/s.
     pub moving: f64,
+    /// Share of the shake about the picture's axes that a stabiliser takes back by a shift of the lens.
+    pub stabilisation: f64,
     /// Length, s.
     pub secs: f64,
     /// Seed of everything random in it.
@@ -131,6 +137,7 @@ impl Handheld {
             turning: r.between(0.3, 1.2),
             main_axis: (0, 1.0),
             moving: r.between(0.05, 0.5),
+            stabilisation: 0.0,
             secs: 20.0,
             seed,
         }
@@ -160,13 +167,22 @@ impl Handheld {
         let steps = ((self.secs + 1.2) / STEP_SECS) as usize;
         let mut turn = So3::IDENTITY;
         let mut orientations = Vec::with_capacity(steps);
+        let camera_from_body = self.body_from_camera.inverse();
+        let mut shake = Vector2::zeros();
+        let mut shifts = Vec::with_capacity(steps);
         for k in 0..steps {
             orientations.push(turn);
-            let middle = begin + (k as f64 + 0.5) * STEP_SECS;
-            turn = turn * So3::exp(&(rates(middle) * STEP_SECS));
+            shifts
+                .push(shake.map(|a: f64| STABILISED_RAD * (a / STABILISED_RAD).tanh()) * self.stabilisation);
+            let step = rates(begin + (k as f64 + 0.5) * STEP_SECS) * STEP_SECS;
+            turn = turn * So3::exp(&step);
+            // About the camera's x the picture moves down, about its y to the left.
+            let seen = camera_from_body * step;
+            shake = shake * (-STEP_SECS / STABILISED_SECS).exp() + Vector2::new(seen.y, -seen.x);
         }
+        let step_of = |t: f64| ((t - begin) / STEP_SECS).clamp(0.0, steps as f64 - 1.0);
         let orientation = |t: f64| {
-            let at = ((t - begin) / STEP_SECS).clamp(0.0, steps as f64 - 1.0);
+            let at = step_of(t);
             let k = at as usize;
             orientations[k] * So3::exp(&(rates(t) * ((at - k as f64) * STEP_SECS)))
         };
@@ -176,7 +192,7 @@ impl Handheld {
         let camera = |t: f64| {
             let world_from_body = orientation(t);
             let position = centre + velocities.integral_at(t) + world_from_body * (joint + self.lever_arm);
-            (world_from_body * self.body_from_camera, position)
+            (world_from_body * self.body_from_camera, position, shifts[step_of(t) as usize])
         };
         let points = room(&mut r);
         let mut out = HandheldRecording::default();
@@ -199,7 +215,7 @@ impl Handheld {
         &self,
         r: &mut Random,
         points: &[Vector3<f64>],
-        camera: &impl Fn(f64) -> (So3, Vector3<f64>),
+        camera: &impl Fn(f64) -> (So3, Vector3<f64>, Vector2<f64>),
         out: &mut HandheldRecording,
     ) {
         /// A point that is followed, and how far it slides a frame where the tracker is wrong.
@@ -243,25 +259,25 @@ impl Handheld {
         }
     }
 
-    /// Where a point shows at the time of the centre row on the gyroscope's clock.
+    /// Where a point shows at the time of the centre row on the gyroscope's clock, by a camera's orientation, position and shift (focal lengths).
     fn pixel(
         &self,
         point: &Vector3<f64>,
         secs: f64,
-        camera: &impl Fn(f64) -> (So3, Vector3<f64>),
+        camera: &impl Fn(f64) -> (So3, Vector3<f64>, Vector2<f64>),
     ) -> Option<Pixel> {
         let (width, height) = (self.size.0 as f64, self.size.1 as f64);
         let mut late = 0.0;
         let mut pixel = Vector2::zeros();
         for _ in 0..4 {
-            let (world_from_camera, position) = camera(secs + late);
+            let (world_from_camera, position, shift) = camera(secs + late);
             let p = world_from_camera.inverse() * (point - position);
             let [k1, k2] = self.radial;
             let is_pinhole = self.lens == LensModel::RadTan;
             if p.norm() < 0.2 || is_pinhole && (p.z < 0.2 || !is_one_to_one(k1, k2, p.xy().norm() / p.z)) {
                 return None;
             }
-            pixel = self.centre + self.lens.project(self.focal, self.radial, &p)?.at;
+            pixel = self.centre + self.lens.project(self.focal, self.radial, &p)?.at + shift * self.focal;
             late = (pixel.y / (height - 1.0) - 0.5) * self.readout_secs;
         }
         let inside = pixel.x > 8.0 && pixel.y > 8.0 && pixel.x < width - 9.0 && pixel.y < height - 9.0;

@@ -147,6 +147,39 @@ fn a_fisheye_is_told_from_a_pinhole_and_calibrated() {
     assert!(50 * beyond <= 4 * all.len(), "{beyond} beyond 3 sigma");
 }
 
+/// A stabiliser makes a picture move less than the camera turns, as a shorter focal length and a late clock would: it is found, and what it hides with it.
+#[test]
+fn a_stabilised_hand_shows_its_lens_and_clock() {
+    let draws: u64 = std::env::var("VIDAR_CALIBRATION_DRAWS").map_or(4, |d| d.parse().unwrap());
+    let (mut all, mut beyond) = (Vec::new(), 0);
+    for seed in 0..draws {
+        let hand = Handheld { turning: 0.2, pixel_noise: 0.15, outliers: 0.01, ..Handheld::draw(seed) };
+        let truth = Handheld { stabilisation: 0.8, ..hand };
+        let found = calibrate(&truth);
+        let e = errors(&truth, &found);
+        println!(
+            "stabilised {seed}: {:.2?} | f {:.2} % clock {:.2} ms turn {:.2}° readout {:.2} ms {:.1?}",
+            found.image_shift_rad.map(f64::to_degrees),
+            e.focal_percent,
+            e.clock_ms,
+            e.rotation_deg,
+            e.readout_ms,
+            e.sigmas
+        );
+        beyond += e.sigmas.iter().filter(|s| **s > 3.0).count();
+        all.push((found.image_shift_rad.is_some(), e));
+    }
+    let of = |value: fn(&Errors) -> f64| median(all.iter().map(|(_, e)| value(e)).collect());
+    let medians = [of(|e| e.focal_percent), of(|e| e.clock_ms), of(|e| e.rotation_deg), of(|e| e.readout_ms)];
+    let found = all.iter().filter(|(is_found, _)| *is_found).count();
+    println!("medians {medians:.3?}, {beyond} of {} beyond 3 sigma, {found} found", 4 * all.len());
+    for (error, goal) in medians.iter().zip([1.5, 3.0, 1.0, 4.0]) {
+        assert!(*error < goal, "median {error} above {goal}");
+    }
+    assert!(50 * beyond <= 4 * all.len(), "{beyond} beyond 3 sigma");
+    assert_eq!(found, all.len(), "found of all");
+}
+
 /// Recordings: a few by default, as many as `VIDAR_CALIBRATION_DRAWS` says for the table of docs/benchmark/odometry.md.
 #[test]
 fn twenty_seconds_by_hand_calibrate_camera_and_clock() {

@@ -84,7 +84,7 @@ impl CalibrateOutcome {
             lines.push((axis, value(bias, 1e3, "mrad/s", 2)));
         }
         lines.extend(self.noise_lines());
-        lines.extend(disagreement(c).map(|words| ("doubt", format!("{words}; each σ is as much larger"))));
+        lines.extend(disagreement(c).map(|words| ("doubt", words)));
         for compared in self.comparisons() {
             let verdict = if compared.contradicts() { "contradicts" } else { "agrees" };
             lines.push((
@@ -224,6 +224,7 @@ impl CalibrateOutcome {
             "stated_accel_noise": self.stated_noise.map(|n| n.accel_noise_density),
             "pixel_sigma": c.pixel_sigma,
             "gyro_noise_ratio": c.gyro_noise_ratio,
+            "image_shift_deg": c.image_shift_rad.map(f64::to_degrees),
             "images": c.images,
             "checks": checks,
             "file": self.file.as_ref().map(|f| f.display().to_string()),

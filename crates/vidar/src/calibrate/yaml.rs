@@ -66,11 +66,17 @@ impl CalibrateOutcome {
     }
 }
 
-/// That images turn otherwise than the gyroscope says, where they do.
+/// That a stabiliser moves the images, or that they turn otherwise than the gyroscope says, where they do.
 pub(super) fn disagreement(found: &Calibration) -> Option<String> {
+    if let Some(shift) = found.image_shift_rad {
+        let degrees = shift.to_degrees();
+        return Some(format!(
+            "images move as if a stabiliser turned them by {degrees:.1}° (root mean square)"
+        ));
+    }
     let times = found.gyro_noise_ratio;
     (times > 1.0).then(|| {
-        format!("images turn otherwise than the gyroscope says ({times:.1} times its noise), as where they are stabilised or stamps scatter")
+        format!("images turn otherwise than the gyroscope says ({times:.1} times its noise; each σ is as much larger), as where they are stabilised or stamps scatter")
     })
 }
 

@@ -2,7 +2,7 @@
 
 use super::{
     BackSubstitution, FIXED, INVERSE_DISTANCE_PRIOR, KERNEL, NODE, NodeObservation, Noise, POSITION_PRIOR,
-    Point, PointBlock, Reduced, Seen, TOUCHED, Window,
+    Point, PointBlock, Reduced, SHAKES, Seen, TOUCHED, Window,
 };
 use crate::calibration::parameters::{BIAS, Projection};
 use crate::calibration::parameters::{
@@ -29,13 +29,16 @@ impl Window {
         noise: &Noise,
         damping: f64,
     ) -> Option<Reduced> {
-        let own = NODE * self.nodes.len();
+        let own = self.own_unknowns();
         let all = own + DIM;
         let mut h = DMatrix::<f64>::zeros(all, all);
         let mut g = DVector::<f64>::zeros(all);
         let reference = path.at(self.nodes[self.reference].secs + parameters.offset_secs);
-        self.add_priors(&mut h, &mut g, noise);
+        self.add_position_priors(&mut h, &mut g);
+        self.add_turns(&mut h, &mut g, &noise.turns);
         let mut blocks = Vec::with_capacity(self.points.len());
+        // Shares that nothing is taken back of have no derivative.
+        let touched = if noise.turns.is_stabilised() { TOUCHED } else { TOUCHED - SHAKES };
         for point in &self.points {
             let tangents = tangents(&point.direction);
             let weight = 1.0 / (INVERSE_DISTANCE_PRIOR * INVERSE_DISTANCE_PRIOR);
@@ -48,12 +51,12 @@ impl Window {
                 let linear = self.linearise(point, seen, &at, &projection, &reference, &tangents, noise);
                 let w = KERNEL.weight(linear.residual.norm_squared());
                 let weighted = linear.jacobian * w;
-                for (a, &column) in linear.columns.iter().enumerate() {
+                for (a, &column) in linear.columns[..touched].iter().enumerate() {
                     g[column] += weighted.column(a).dot(&linear.residual);
                     for p in 0..3 {
                         coupling[(column, p)] += weighted.column(a).dot(&linear.d_point.column(p));
                     }
-                    for (b, &other) in linear.columns.iter().enumerate().skip(a) {
+                    for (b, &other) in linear.columns[..touched].iter().enumerate().skip(a) {
                         let value = weighted.column(a).dot(&linear.jacobian.column(b));
                         h[(column.max(other), column.min(other))] += value;
                     }
@@ -88,33 +91,14 @@ impl Window {
         Some(Reduced { hessian, gradient, back })
     }
 
-    fn add_priors(&self, h: &mut DMatrix<f64>, g: &mut DVector<f64>, noise: &Noise) {
+    fn add_position_priors(&self, h: &mut DMatrix<f64>, g: &mut DVector<f64>) {
         for (k, node) in self.nodes.iter().enumerate() {
-            let is_reference = k == self.reference;
-            let sigma = if is_reference { FIXED } else { POSITION_PRIOR };
+            let sigma = if k == self.reference { FIXED } else { POSITION_PRIOR };
             let weight = 1.0 / (sigma * sigma);
             for a in 0..3 {
                 let at = NODE * k + 3 + a;
                 h[(at, at)] += weight;
                 g[at] -= weight * node.position[a];
-                if is_reference {
-                    let at = NODE * k + a;
-                    h[(at, at)] += 1.0 / (FIXED * FIXED);
-                    g[at] -= node.drift[a] / (FIXED * FIXED);
-                }
-            }
-            if let Some(next) = self.nodes.get(k + 1) {
-                let sigma = self.walk_sigma(k, noise);
-                let weight = 1.0 / (sigma * sigma);
-                for a in 0..3 {
-                    let (i, j) = (NODE * k + a, NODE * (k + 1) + a);
-                    let r = next.drift[a] - node.drift[a];
-                    h[(i, i)] += weight;
-                    h[(j, j)] += weight;
-                    h[(j, i)] -= weight;
-                    g[i] += weight * r;
-                    g[j] -= weight * r;
-                }
             }
         }
     }
@@ -130,13 +114,13 @@ impl Window {
         tangents: &[Vector3<f64>; 2],
         noise: &Noise,
     ) -> Linear {
-        let own = NODE * self.nodes.len();
+        let own = self.own_unknowns();
         let by_sigma = 1.0 / noise.pixel;
         let d_camera: Matrix2x3<f64> = projection.d_point * by_sigma;
         let d_ray: Matrix2x3<f64> = d_camera * at.turn;
         // A left rotation φ of the body turns the ray by −φ.
         let d_turn: Matrix2x3<f64> = d_ray * at.ray.cross_matrix();
-        let from_first = reference.rotation.transpose();
+        let from_first = at.drift * reference.rotation.transpose();
         let rate = from_first * at.path.rotation * at.path.rate;
         let mut jacobian = SMatrix::<f64, 2, TOUCHED>::zeros();
         let mut columns = [0; TOUCHED];
@@ -149,7 +133,14 @@ impl Window {
         for p in 0..DIM {
             columns[12 + p] = own + p;
         }
-        jacobian.fixed_columns_mut::<3>(0).copy_from(&d_turn);
+        let d_shift = Matrix2x3::from_rows(&[-at.turn.row(1), at.turn.row(0).into_owned()]);
+        let d_drift = self.shakes.by_drift(&d_turn, &(d_shift * (at.focal * by_sigma)), &at.turn);
+        jacobian.fixed_columns_mut::<3>(0).copy_from(&d_drift);
+        for (j, rate) in self.shakes.rates(seen.node).iter().enumerate() {
+            columns[12 + DIM + j] = own - SHAKES + j;
+            jacobian.column_mut(12 + DIM + j).copy_from(&(d_drift * rate * -at.late));
+        }
+        let d_taken_back = d_drift * self.shakes.taken_back(seen.node, 1.0);
         let mut velocity = Vector3::zeros();
         for (n, (node, weight, slope)) in at.near.iter().enumerate() {
             let block = d_ray * (-point.inverse_distance * weight);
@@ -158,10 +149,12 @@ impl Window {
         }
         let first = 12;
         jacobian.fixed_columns_mut::<LENS>(first + FOCAL).copy_from(&(projection.d_lens * by_sigma));
-        jacobian.column_mut(first + OFFSET).copy_from(&(d_turn * (rate - reference.rate)));
-        jacobian
-            .column_mut(first + READOUT)
-            .copy_from(&((d_turn * rate - d_ray * velocity * point.inverse_distance) * seen.row));
+        let mut d_focal = jacobian.column_mut(first + FOCAL);
+        d_focal += at.shift * by_sigma;
+        jacobian.column_mut(first + OFFSET).copy_from(&(d_turn * (rate - at.drift * reference.rate)));
+        jacobian.column_mut(first + READOUT).copy_from(
+            &((d_turn * rate - d_taken_back - d_ray * velocity * point.inverse_distance) * seen.row),
+        );
         jacobian
             .fixed_columns_mut::<3>(first + ROTATION)
             .copy_from(&(d_camera * at.in_camera.cross_matrix()));
@@ -173,19 +166,20 @@ impl Window {
         d_point.column_mut(0).copy_from(&(d_ray * tangents[0]));
         d_point.column_mut(1).copy_from(&(d_ray * tangents[1]));
         d_point.column_mut(2).copy_from(&(d_ray * -at.position));
-        Linear { residual: (seen.pixel - projection.pixel) * by_sigma, columns, jacobian, d_point }
+        Linear { residual: (seen.pixel - at.shown(projection)) * by_sigma, columns, jacobian, d_point }
     }
 
     /// Moves nodes and points by what follows from the parameters' step.
     pub fn step(&mut self, reduced: &Reduced, parameters: &Tangent) {
         let back = &reduced.back;
-        let own = NODE * self.nodes.len();
+        let own = self.own_unknowns();
         let step = DVector::from_column_slice(parameters.as_slice());
         let nodes = &back.nodes - &back.by_parameters * &step;
         for (k, node) in self.nodes.iter_mut().enumerate() {
             node.drift += nodes.fixed_rows::<3>(NODE * k);
             node.position += nodes.fixed_rows::<3>(NODE * k + 3);
         }
+        self.shakes.shares += nodes.fixed_rows::<SHAKES>(own - SHAKES);
         for (point, block) in self.points.iter_mut().zip(&back.points) {
             let mut right = block.gradient;
             for p in 0..3 {
