@@ -275,10 +275,8 @@ fn behind_any_stabiliser(
     if !is_lens_doubtful && found.gyro_noise_ratio <= 1.0 {
         return Ok(found);
     }
-    match tracks.explained_by_a_stabiliser(solved) {
-        Some(stabilised) => calibration(tracks, &stabilised),
-        None => Ok(found),
-    }
+    let stabilised = tracks.explained_by_a_stabiliser(solved);
+    Ok(stabilised.and_then(|stabilised| calibration(tracks, &stabilised).ok()).unwrap_or(found))
 }
 
 /// A solution with its standard deviations.

@@ -57,7 +57,7 @@ pub(super) struct Point {
 pub(super) struct Node {
     /// Stamp, s.
     pub secs: f64,
-    /// Left rotation that corrects the gyroscope's.
+    /// Left rotation that corrects the gyroscope's; where there is a stabiliser ([`Shakes`]) its part across the view is a shift of the picture.
     pub drift: Vector3<f64>,
     /// In the reference image's body axes.
     pub position: Vector3<f64>,
