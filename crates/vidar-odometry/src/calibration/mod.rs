@@ -31,7 +31,7 @@ use parameters::{BIAS, CENTRE, FOCAL, GivenLens, K1, K2, OFFSET, READOUT, ROTATI
 use path::GyroPath;
 use solve::sigma_factor;
 pub use tracker::FeatureTracker;
-use tracks::{Solved, Tracks};
+use tracks::{DOUBTFUL_PX, Solved, Tracks};
 use vidar_core::camera::{CameraModel, Pixel};
 use vidar_core::{ImuSample, LandmarkId, So3, Timestamp};
 
@@ -272,7 +272,9 @@ fn behind_any_stabiliser(
     let found = calibration(tracks, solved)?;
     let is_lens_doubtful =
         tracks.lens.is_none() && found.focal_px.sigma > DOUBTFUL_FOCAL * found.focal_px.value;
-    if !is_lens_doubtful && found.gyro_noise_ratio <= 1.0 {
+    // Shifts would explain a gyroscope that is left-handed, too.
+    let is_explained = found.pixel_sigma < DOUBTFUL_PX;
+    if !is_explained || !is_lens_doubtful && found.gyro_noise_ratio <= 1.0 {
         return Ok(found);
     }
     let stabilised = tracks.explained_by_a_stabiliser(solved);

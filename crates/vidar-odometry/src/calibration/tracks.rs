@@ -15,7 +15,7 @@ use vidar_core::{LieGroup, So3};
 /// A radial-tangential lens as wide as this (focal length in image widths; 78°) may be a fisheye, and one that leaves more than
 /// this much of the tracks, px, may be anything else.
 const WIDE_FOCAL: f64 = 0.62;
-const DOUBTFUL_PX: f64 = 0.4;
+pub(super) const DOUBTFUL_PX: f64 = 0.4;
 /// By how much another lens or mount has to explain the tracks better, log likelihood per observation: what is left is not white, and a mount that
 /// nothing tells from the right one was better by 0.005 (simulated). On a GoPro's walk the wrong ones are worse by 3.
 const MARGIN: f64 = 0.02;
