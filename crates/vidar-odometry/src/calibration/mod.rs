@@ -71,7 +71,7 @@ const LAG_SECS: f64 = 0.01;
 /// simulated stabilised one 0.015 where it was 6 % off.
 const DOUBTFUL_FOCAL: f64 = 0.01;
 /// With a stabiliser in the model: focal lengths of twelve rendered recordings were off by −1.4 to +1.6 % at stated 0.2 to 0.8 (one 2.5), clocks of eleven by
-/// 0.1 to 9.6 ms at stated 0.2 to 5.2; that of one which circled a hall by 18 at 3.5.
+/// up to 9.6 ms at stated 0.2 to 5.2; that of one which circled a hall by 18 at 3.5.
 const STABILISED_FOCAL_FLOOR: f64 = 0.008;
 const STABILISED_LAG_SECS: f64 = 0.005;
 

@@ -3,7 +3,7 @@
 use super::hand_eye::BASIN_SECS;
 use super::parameters::{DIM, GivenLens, LENS, OFFSET, Parameters, ROTATION, Tangent, prior_sigmas};
 use super::path::GyroPath;
-use super::window::{Noise, Reduced, Turns, Window, shift_sigma};
+use super::window::{Noise, Reduced, Turns, Window, rms_per_axis, shift_sigma};
 use crate::gyro_alignment::RateSample;
 use nalgebra::{SMatrix, Vector3};
 use rayon::prelude::*;
@@ -307,8 +307,7 @@ impl Solution {
     /// How far a stabiliser moves the images (root mean square of each axis, rad), where there is one.
     pub fn image_shift_rad(&self) -> Option<f64> {
         let nodes = self.windows.iter().flat_map(|window| &window.nodes);
-        let (count, sum) = nodes.fold((0, 0.0), |(n, sum), node| (n + 3, sum + node.drift.norm_squared()));
-        self.noise.turns.is_stabilised().then(|| (sum / f64::from(count.max(1))).sqrt())
+        self.noise.turns.is_stabilised().then(|| rms_per_axis(nodes.map(|node| node.drift)))
     }
 
     /// Solutions of the same stretches compare by this: the cost grows as the assumed noise shrinks, so the logarithms of the

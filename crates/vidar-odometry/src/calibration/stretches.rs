@@ -2,7 +2,7 @@
 
 use super::parameters::Parameters;
 use super::path::GyroPath;
-use super::window::{Node, NodeObservation, Point, Shakes, Window};
+use super::window::{Node, NodeObservation, Point, Window};
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
 use rustc_hash::FxHashMap;
@@ -99,12 +99,12 @@ fn stretch(size: (f64, f64), images: &[ImageFeatures]) -> Option<Window> {
             observations: std::mem::take(&mut tracks[k].1),
         })
         .collect();
-    let nodes: Vec<Node> = images
+    let nodes = images
         .iter()
         .map(|i| Node { secs: i.secs, drift: Vector3::zeros(), position: Vector3::zeros() })
         .collect();
-    let (reference, shakes) = (nodes.len() / 2, Shakes::none(nodes.len()));
-    (points.len() >= MIN_POINTS).then_some(Window { nodes, points, reference, shakes })
+    let reference = images.len() / 2;
+    (points.len() >= MIN_POINTS).then_some(Window { nodes, points, reference, shakes: None })
 }
 
 impl Window {
@@ -119,7 +119,7 @@ impl Window {
         for node in &mut self.nodes {
             (node.drift, node.position) = (Vector3::zeros(), Vector3::zeros());
         }
-        self.shakes = Shakes::none(self.nodes.len());
+        self.shakes = None;
         let at = |secs: f64| path.at(secs + parameters.offset_secs).rotation;
         let reference_from_first = at(self.nodes[self.reference].secs).transpose();
         for point in &mut self.points {

@@ -2,7 +2,7 @@
 
 use super::parameters::{DIM, Parameters, Tangent};
 use super::path::GyroPath;
-use super::window::{Node, NodeObservation, Noise, Point, Shakes, Turns, Window};
+use super::window::{Node, NodeObservation, Noise, Point, Turns, Window};
 use super::*;
 use crate::simulate::{Handheld, Random};
 use nalgebra::Vector2;
@@ -29,7 +29,7 @@ fn small() -> (Window, Parameters, Vec<RateSample>) {
             RateSample { secs: t, rate: Vector3::new((3.0 * t).sin(), 0.8, (2.0 * t).cos()) }
         })
         .collect();
-    let nodes: Vec<Node> = (0..4)
+    let nodes = (0..4)
         .map(|k| Node {
             secs: 0.3 + 0.1 * f64::from(k),
             drift: r.normal3() * 1e-3,
@@ -61,8 +61,7 @@ fn small() -> (Window, Parameters, Vec<RateSample>) {
         bias: Vector3::new(0.01, 0.02, -0.01),
         scale: Vector3::new(0.01, -0.01, 0.02),
     };
-    let shakes = Shakes::none(nodes.len());
-    (Window { nodes, points, reference: 2, shakes }, parameters, samples)
+    (Window { nodes, points, reference: 2, shakes: None }, parameters, samples)
 }
 
 /// Both kinds of turns, and the stretch with the shakes of the second.

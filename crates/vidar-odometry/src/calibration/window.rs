@@ -13,8 +13,8 @@ mod turns;
 use super::parameters::{DIM, Parameters, Projection, Tangent};
 use super::path::{GyroPath, PathPoint};
 use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, Vector2, Vector3};
-use turns::SHAKES;
-pub(super) use turns::{Shakes, Turns, shift_sigma};
+use turns::{SHAKES, Shakes, turn_and_shift};
+pub(super) use turns::{Turns, rms_per_axis, shift_sigma};
 use vidar_core::camera::Pixel;
 use vidar_core::{LieGroup, So3};
 use vidar_solve::Kernel;
@@ -78,8 +78,8 @@ pub(super) struct Window {
     pub points: Vec<Point>,
     /// The image whose frame is the stretch's.
     pub reference: usize,
-    /// What a stabiliser may take back of the turns.
-    pub shakes: Shakes,
+    /// What a stabiliser may take back of the turns, where one is looked for.
+    pub shakes: Option<Shakes>,
 }
 
 /// What is left for the parameters once a stretch's own unknowns are eliminated: `H δ = g`.
@@ -170,13 +170,16 @@ impl Window {
         let late = seen.row * parameters.readout_secs;
         let at = path.at(node.secs + parameters.offset_secs + late);
         let body_from_camera = parameters.body_from_camera.matrix();
-        let reference_from_body = reference.rotation.transpose() * at.rotation;
-        let [turns, shifts] = self.shakes.parts(
-            &(node.drift - self.shakes.taken_back(seen.node, late)),
-            &(reference_from_body * body_from_camera),
-        );
+        let reference_from_camera = reference.rotation.transpose() * at.rotation * body_from_camera;
+        let [turns, shifts] = match &self.shakes {
+            Some(shakes) => {
+                let drift = node.drift - shakes.taken_back(seen.node, late);
+                turn_and_shift(&drift, &reference_from_camera)
+            }
+            None => [node.drift, Vector3::zeros()],
+        };
         let drift = So3::exp(&turns).matrix();
-        let turn = (drift * reference_from_body * body_from_camera).transpose();
+        let turn = (drift * reference_from_camera).transpose();
         // Turned about the camera's x a camera would see things move down, about its y to the left.
         let moved = turn * shifts;
         let (focal, shift) = (parameters.focal, Vector2::new(-moved.y, moved.x) * parameters.focal);
@@ -200,9 +203,9 @@ impl Window {
         [(at[0], wa.0, wa.1), (at[1], wb.0, wb.1), (at[2], wc.0, wc.1)]
     }
 
-    /// Unknowns that are eliminated with the images.
+    /// Unknowns of the stretch itself, which are eliminated: of its images, and the shares of a stabiliser.
     fn own_unknowns(&self) -> usize {
-        NODE * self.nodes.len() + SHAKES
+        NODE * self.nodes.len() + if self.shakes.is_some() { SHAKES } else { 0 }
     }
 
     fn prior_cost(&self, noise: &Noise) -> f64 {

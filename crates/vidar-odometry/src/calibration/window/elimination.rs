@@ -2,7 +2,7 @@
 
 use super::{
     BackSubstitution, FIXED, INVERSE_DISTANCE_PRIOR, KERNEL, NODE, NodeObservation, Noise, POSITION_PRIOR,
-    Point, PointBlock, Reduced, SHAKES, Seen, TOUCHED, Window,
+    Point, PointBlock, Reduced, SHAKES, Seen, TOUCHED, Window, turns::by_turn_and_shift,
 };
 use crate::calibration::parameters::{BIAS, Projection};
 use crate::calibration::parameters::{
@@ -38,7 +38,7 @@ impl Window {
         self.add_turns(&mut h, &mut g, &noise.turns);
         let mut blocks = Vec::with_capacity(self.points.len());
         // Shares that nothing is taken back of have no derivative.
-        let touched = if noise.turns.is_stabilised() { TOUCHED } else { TOUCHED - SHAKES };
+        let touched = if self.shakes.is_some() { TOUCHED } else { TOUCHED - SHAKES };
         for point in &self.points {
             let tangents = tangents(&point.direction);
             let weight = 1.0 / (INVERSE_DISTANCE_PRIOR * INVERSE_DISTANCE_PRIOR);
@@ -133,14 +133,17 @@ impl Window {
         for p in 0..DIM {
             columns[12 + p] = own + p;
         }
-        let d_shift = Matrix2x3::from_rows(&[-at.turn.row(1), at.turn.row(0).into_owned()]);
-        let d_drift = self.shakes.by_drift(&d_turn, &(d_shift * (at.focal * by_sigma)), &at.turn);
-        jacobian.fixed_columns_mut::<3>(0).copy_from(&d_drift);
-        for (j, rate) in self.shakes.rates(seen.node).iter().enumerate() {
-            columns[12 + DIM + j] = own - SHAKES + j;
-            jacobian.column_mut(12 + DIM + j).copy_from(&(d_drift * rate * -at.late));
+        let (mut d_drift, mut d_taken_back) = (d_turn, Vector2::zeros());
+        if let Some(shakes) = &self.shakes {
+            let d_shift = Matrix2x3::from_rows(&[-at.turn.row(1), at.turn.row(0).into_owned()]);
+            d_drift = by_turn_and_shift(&d_turn, &(d_shift * (at.focal * by_sigma)), &at.turn);
+            d_taken_back = d_drift * shakes.taken_back(seen.node, 1.0);
+            for (j, rate) in shakes.rates(seen.node).iter().enumerate() {
+                columns[12 + DIM + j] = own - SHAKES + j;
+                jacobian.column_mut(12 + DIM + j).copy_from(&(d_drift * rate * -at.late));
+            }
         }
-        let d_taken_back = d_drift * self.shakes.taken_back(seen.node, 1.0);
+        jacobian.fixed_columns_mut::<3>(0).copy_from(&d_drift);
         let mut velocity = Vector3::zeros();
         for (n, (node, weight, slope)) in at.near.iter().enumerate() {
             let block = d_ray * (-point.inverse_distance * weight);
@@ -179,7 +182,9 @@ impl Window {
             node.drift += nodes.fixed_rows::<3>(NODE * k);
             node.position += nodes.fixed_rows::<3>(NODE * k + 3);
         }
-        self.shakes.shares += nodes.fixed_rows::<SHAKES>(own - SHAKES);
+        if let Some(shakes) = &mut self.shakes {
+            shakes.shares += nodes.fixed_rows::<SHAKES>(own - SHAKES);
+        }
         for (point, block) in self.points.iter_mut().zip(&back.points) {
             let mut right = block.gradient;
             for p in 0..3 {

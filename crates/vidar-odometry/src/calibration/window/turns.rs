@@ -1,6 +1,6 @@
 //! How the images of a stretch turn otherwise than the gyroscope says: what its drift is worth.
 
-use super::{FIXED, NODE, Window};
+use super::{FIXED, NODE, Node, Window};
 use crate::calibration::parameters::Parameters;
 use crate::calibration::path::GyroPath;
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, SVector, Vector3};
@@ -33,14 +33,13 @@ pub(in crate::calibration) enum Turns {
     Stabilised(f64),
 }
 
-/// The shake of each image of a stretch, and the shares of it that a stabiliser takes back.
+/// The shake of each image of a stretch, and the shares of it that a stabiliser takes back: a stretch has them while one is looked for.
 #[derive(Clone, Debug)]
 pub(in crate::calibration) struct Shakes {
     /// How far each image is turned from where the camera was meant to look: in the reference's body axes, rad.
     of_nodes: Vec<[Vector3<f64>; SHAKES]>,
     /// How fast that changes, rad/s.
     rates: Vec<[Vector3<f64>; SHAKES]>,
-    are_taken_back: bool,
     /// The part of each kind of shake that is taken back.
     pub(super) shares: SVector<f64, SHAKES>,
 }
@@ -56,12 +55,6 @@ impl Turns {
 }
 
 impl Shakes {
-    /// None, for so many images.
-    pub fn none(nodes: usize) -> Self {
-        let nothing = vec![[Vector3::zeros(); SHAKES]; nodes];
-        Self { of_nodes: nothing.clone(), rates: nothing, are_taken_back: false, shares: SVector::zeros() }
-    }
-
     /// How fast the shakes of a node change, rad/s.
     pub(super) fn rates(&self, node: usize) -> &[Vector3<f64>; SHAKES] {
         &self.rates[node]
@@ -72,41 +65,38 @@ impl Shakes {
         self.rates[node].iter().zip(&self.shares).map(|(rate, share)| rate * (share * secs)).sum()
     }
 
-    /// The parts of a drift that turn the camera, as the gyroscope's error does, and that move the picture, as a lens does. The difference is a keystone: 2.5 px at
-    /// the side of a picture that is 77° wide and 640 px, for 1°. With turns alone focal lengths came out up to 7 % short, with residuals half as large again.
-    pub(super) fn parts(
-        &self,
-        drift: &Vector3<f64>,
-        reference_from_camera: &Matrix3<f64>,
-    ) -> [Vector3<f64>; 2] {
-        if !self.are_taken_back {
-            return [*drift, Vector3::zeros()];
-        }
-        let view = reference_from_camera.column(2);
-        let about_the_view = view * view.dot(drift);
-        [about_the_view, drift - about_the_view]
+    /// By how much a drift goes beyond what the shares of its node's shake say.
+    fn beyond(&self, node: usize, drift: &Vector3<f64>) -> Vector3<f64> {
+        let shakes = self.of_nodes[node].iter().zip(&self.shares);
+        drift + shakes.map(|(shake, share)| shake * *share).sum::<Vector3<f64>>()
     }
+}
 
-    /// The derivatives of a pixel by a drift, from those by a rotation and by a shift of the picture.
-    pub(super) fn by_drift(
-        &self,
-        turns: &Matrix2x3<f64>,
-        shifts: &Matrix2x3<f64>,
-        camera_from_reference: &Matrix3<f64>,
-    ) -> Matrix2x3<f64> {
-        if !self.are_taken_back {
-            return *turns;
-        }
-        let view = camera_from_reference.row(2);
-        let about_the_view = view.transpose() * view;
-        turns * about_the_view + shifts * (Matrix3::identity() - about_the_view)
-    }
+/// The parts of a drift that turn the camera, as the gyroscope's error does, and that a stabiliser moves the picture by. The difference is a keystone: 2.5 px at
+/// the side of a picture that is 77° wide and 640 px, for 1°. With turns alone focal lengths came out up to 7 % short, with residuals half as large again.
+pub(super) fn turn_and_shift(
+    drift: &Vector3<f64>,
+    reference_from_camera: &Matrix3<f64>,
+) -> [Vector3<f64>; 2] {
+    let view = reference_from_camera.column(2);
+    let about_the_view = view * view.dot(drift);
+    [about_the_view, drift - about_the_view]
+}
+
+/// The derivatives of a pixel by such a drift, from those by a rotation and by a shift of the picture.
+pub(super) fn by_turn_and_shift(
+    by_turn: &Matrix2x3<f64>,
+    by_shift: &Matrix2x3<f64>,
+    camera_from_reference: &Matrix3<f64>,
+) -> Matrix2x3<f64> {
+    let view = camera_from_reference.row(2);
+    let about_the_view = view.transpose() * view;
+    by_turn * about_the_view + by_shift * (Matrix3::identity() - about_the_view)
 }
 
 impl Window {
     /// Takes the shake of each image from the gyroscope, for a stabiliser to take back.
     pub fn find_shakes(&mut self, parameters: &Parameters, path: &GyroPath) {
-        self.shakes.are_taken_back = true;
         let rotation = |secs: f64| path.at(secs + parameters.offset_secs).rotation;
         let reference_from_first = rotation(self.nodes[self.reference].secs).transpose();
         let axis = parameters.body_from_camera.matrix().column(2).into_owned();
@@ -125,11 +115,17 @@ impl Window {
             });
             [fast[0], fast[1], slow[0], slow[1]]
         };
-        for (k, node) in self.nodes.iter().enumerate() {
-            let [before, after] = [-RATE_SECS, RATE_SECS].map(|secs| shakes(node.secs + secs));
-            self.shakes.of_nodes[k] = shakes(node.secs);
-            self.shakes.rates[k] = std::array::from_fn(|j| (after[j] - before[j]) / (2.0 * RATE_SECS));
-        }
+        let (of_nodes, rates) = self
+            .nodes
+            .iter()
+            .map(|node| {
+                let [before, after] = [-RATE_SECS, RATE_SECS].map(|secs| shakes(node.secs + secs));
+                let rates = std::array::from_fn(|j| (after[j] - before[j]) / (2.0 * RATE_SECS));
+                (shakes(node.secs), rates)
+            })
+            .unzip();
+        let shares = self.shakes.as_ref().map_or_else(SVector::zeros, |known| known.shares);
+        self.shakes = Some(Shakes { of_nodes, rates, shares });
     }
 
     /// What the nodes' rotations are off, which is believed to be zero: of the gyroscope's walk from each to the next, or of each from what a stabiliser leaves.
@@ -141,50 +137,72 @@ impl Window {
                 let sigma = |secs: f64| noise * secs.max(1e-3).sqrt();
                 pairs.map(|p| (p[1].drift - p[0].drift, sigma(p[1].secs - p[0].secs))).collect()
             }
-            Turns::Stabilised(sigma) => (0..self.nodes.len()).map(|k| (self.shift(k), *sigma)).collect(),
+            Turns::Stabilised(sigma) => {
+                let beyond = |(k, node): (usize, &Node)| {
+                    self.shakes.as_ref().map_or(node.drift, |shakes| shakes.beyond(k, &node.drift))
+                };
+                self.nodes.iter().enumerate().map(|node| (beyond(node), *sigma)).collect()
+            }
         }
-    }
-
-    /// By how much a node is turned beyond what the shares of its shake say.
-    fn shift(&self, k: usize) -> Vector3<f64> {
-        let shakes = self.shakes.of_nodes[k].iter().zip(&self.shakes.shares);
-        self.nodes[k].drift + shakes.map(|(shake, share)| shake * *share).sum::<Vector3<f64>>()
     }
 
     /// Twice the cost of the rotations.
     pub(super) fn turns_chi2(&self, turns: &Turns) -> f64 {
         let off = self.off_turns(turns).into_iter();
         let off: f64 = off.map(|(off, sigma)| off.norm_squared() / (sigma * sigma)).sum();
-        let shares = self.shakes.shares.norm_squared() / (SHARE_SIGMA * SHARE_SIGMA);
-        let reference = match turns {
-            Turns::Gyroscope(_) => self.nodes[self.reference].drift.norm_squared() / (FIXED * FIXED),
-            Turns::Stabilised(_) => 0.0,
+        let held = match (turns, &self.shakes) {
+            (Turns::Gyroscope(_), _) => self.nodes[self.reference].drift.norm_squared() / (FIXED * FIXED),
+            (Turns::Stabilised(_), Some(shakes)) => {
+                shakes.shares.norm_squared() / (SHARE_SIGMA * SHARE_SIGMA)
+            }
+            (Turns::Stabilised(_), None) => 0.0,
         };
-        off + shares + reference
+        off + held
     }
 
     /// Its derivatives (lower triangle).
     pub(super) fn add_turns(&self, h: &mut DMatrix<f64>, g: &mut DVector<f64>, turns: &Turns) {
+        match (turns, &self.shakes) {
+            (Turns::Stabilised(_), Some(shakes)) => self.add_shifts(h, g, turns, shakes),
+            _ => self.add_walk(h, g, turns),
+        }
+    }
+
+    /// The gyroscope's: from each node to the next, from the reference on.
+    fn add_walk(&self, h: &mut DMatrix<f64>, g: &mut DVector<f64>, turns: &Turns) {
+        for (k, (off, sigma)) in self.off_turns(turns).into_iter().enumerate() {
+            let weight = 1.0 / (sigma * sigma);
+            for a in 0..3 {
+                let (i, j) = (NODE * k + a, NODE * (k + 1) + a);
+                h[(i, i)] += weight;
+                h[(j, j)] += weight;
+                h[(j, i)] -= weight;
+                g[i] += weight * off[a];
+                g[j] -= weight * off[a];
+            }
+        }
+        let weight = 1.0 / (FIXED * FIXED);
+        for a in 0..3 {
+            let at = NODE * self.reference + a;
+            h[(at, at)] += weight;
+            g[at] -= weight * self.nodes[self.reference].drift[a];
+        }
+    }
+
+    /// A stabiliser's: of each node by itself, and of the shares.
+    fn add_shifts(&self, h: &mut DMatrix<f64>, g: &mut DVector<f64>, turns: &Turns, shakes: &Shakes) {
         let shares = NODE * self.nodes.len();
         for j in 0..SHAKES {
             h[(shares + j, shares + j)] += 1.0 / (SHARE_SIGMA * SHARE_SIGMA);
-            g[shares + j] -= self.shakes.shares[j] / (SHARE_SIGMA * SHARE_SIGMA);
+            g[shares + j] -= shakes.shares[j] / (SHARE_SIGMA * SHARE_SIGMA);
         }
         for (k, (off, sigma)) in self.off_turns(turns).into_iter().enumerate() {
             let weight = 1.0 / (sigma * sigma);
             for a in 0..3 {
                 let (i, r) = (NODE * k + a, off[a]);
                 h[(i, i)] += weight;
-                if !turns.is_stabilised() {
-                    let j = NODE * (k + 1) + a;
-                    h[(j, j)] += weight;
-                    h[(j, i)] -= weight;
-                    g[i] += weight * r;
-                    g[j] -= weight * r;
-                    continue;
-                }
                 g[i] -= weight * r;
-                let shakes = self.shakes.of_nodes[k].map(|shake| shake[a]);
+                let shakes = shakes.of_nodes[k].map(|shake| shake[a]);
                 for (m, shake) in shakes.iter().enumerate() {
                     h[(shares + m, i)] += weight * shake;
                     g[shares + m] -= weight * shake * r;
@@ -194,20 +212,17 @@ impl Window {
                 }
             }
         }
-        if !turns.is_stabilised() {
-            let weight = 1.0 / (FIXED * FIXED);
-            for a in 0..3 {
-                let at = NODE * self.reference + a;
-                h[(at, at)] += weight;
-                g[at] -= weight * self.nodes[self.reference].drift[a];
-            }
-        }
     }
 }
 
 /// The standard deviation of images' rotations in stabilised stretches, rad.
 pub(in crate::calibration) fn shift_sigma(windows: &[Window], turns: &Turns) -> f64 {
     let off = windows.iter().flat_map(|window| window.off_turns(turns));
-    let (count, sum) = off.fold((0, 0.0), |(n, sum), (off, _)| (n + 3, sum + off.norm_squared()));
-    (sum / f64::from(count.max(1))).sqrt().clamp(SHIFT_SIGMA.0, SHIFT_SIGMA.1)
+    rms_per_axis(off.map(|(off, _)| off)).clamp(SHIFT_SIGMA.0, SHIFT_SIGMA.1)
+}
+
+/// Root mean square of the components; zero of none.
+pub(in crate::calibration) fn rms_per_axis(vectors: impl Iterator<Item = Vector3<f64>>) -> f64 {
+    let (count, sum) = vectors.fold((0, 0.0), |(n, sum), vector| (n + 3, sum + vector.norm_squared()));
+    (sum / f64::from(count.max(1))).sqrt()
 }
