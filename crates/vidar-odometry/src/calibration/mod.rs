@@ -122,8 +122,8 @@ pub struct Calibration {
     /// How many times the gyroscope's noise images turn otherwise than it says, as where they are stabilised or stamps scatter; 1 where that is nothing but
     /// noise. Standard deviations are multiplied by it.
     pub gyro_noise_ratio: f64,
-    /// How far a stabiliser moves the images, as the angle by which the camera would have to turn (root mean square of each axis, rad), where one explains the
-    /// tracks better than the noise of the gyroscope does.
+    /// How far images are shifted, as the angle by which the camera would have to turn (root mean square of each axis, rad), where a stabiliser explains the
+    /// tracks better than the noise of the gyroscope does. Stamps that scatter look like that, too.
     pub image_shift_rad: Option<f64>,
 }
 
