@@ -37,6 +37,12 @@ impl Envelope {
         self.first.len()
     }
 
+    /// All rows, to be split and added to.
+    pub(super) fn rows(&mut self) -> Rows<'_> {
+        let Self { first, begin, values } = self;
+        Rows { first, begin, from: 0, values }
+    }
+
     /// Sets every entry to zero.
     pub(super) fn clear(&mut self) {
         self.values.fill(0.0);
@@ -58,13 +64,6 @@ impl Envelope {
 
     fn row(&self, row: usize) -> &[f64] {
         &self.values[self.begin[row]..self.begin[row + 1]]
-    }
-
-    /// `length` entries of a row from `column` on, which the envelope holds.
-    #[inline(always)]
-    pub(super) fn part_mut(&mut self, row: usize, column: usize, length: usize) -> &mut [f64] {
-        let at = self.begin[row] + column - self.first[row];
-        &mut self.values[at..at + length]
     }
 
     /// Factorises `self + diag(extra)` into `factor`, which has the same envelope; whether it is positive definite.
@@ -110,6 +109,37 @@ impl Envelope {
                 *target -= l * value;
             }
         }
+    }
+}
+
+/// Neighbouring rows of an envelope, from row `from` on.
+#[derive(Debug)]
+pub(super) struct Rows<'a> {
+    first: &'a [usize],
+    begin: &'a [usize],
+    from: usize,
+    values: &'a mut [f64],
+}
+
+impl Rows<'_> {
+    /// The rows before `row`, and the others.
+    pub(super) fn split_at(self, row: usize) -> (Self, Self) {
+        let Self { first, begin, from, values } = self;
+        let (before, others) = values.split_at_mut(begin[row] - begin[from]);
+        (Self { first, begin, from, values: before }, Self { first, begin, from: row, values: others })
+    }
+
+    /// As [`Envelope::add`].
+    #[inline(always)]
+    pub(super) fn add(&mut self, row: usize, column: usize, value: f64) {
+        self.part_mut(row, column, 1)[0] += value;
+    }
+
+    /// `length` entries of a row from `column` on, which the envelope holds.
+    #[inline(always)]
+    pub(super) fn part_mut(&mut self, row: usize, column: usize, length: usize) -> &mut [f64] {
+        let at = self.begin[row] - self.begin[self.from] + column - self.first[row];
+        &mut self.values[at..at + length]
     }
 }
 

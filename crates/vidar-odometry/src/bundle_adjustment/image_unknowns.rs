@@ -12,7 +12,8 @@
 use super::image_prior::{ImagePrior, ImageUnknown, Process};
 use super::observation::MovingBody;
 use super::problem::{FRAME_DIM, Problem};
-use super::system::{ByImage, LandmarkBlock, System};
+use super::reprojections::Part;
+use super::system::{ByImage, ImageBlock, LandmarkBlock, ObservationBlock, System};
 use crate::backend::product;
 use nalgebra::{Matrix3, Vector3};
 
@@ -101,51 +102,73 @@ pub(super) fn add_prior(problem: &Problem, system: &mut System) {
     }
 }
 
+/// Adds an observation's part in the rows of its image's own unknowns.
+#[inline(always)]
+pub(super) fn add(problem: &Problem, block: &LandmarkBlock, at: usize, part: &mut Part<'_>) {
+    let (Some(ImageBlock { by_image, .. }), seen) = (block.images.get(at), &block.observations[at]) else {
+        return;
+    };
+    let from = problem.offset(seen.frame);
+    let with_state = seen.by_state.tr_mul(by_image);
+    let square = by_image.tr_mul(by_image);
+    for i in 0..problem.prior.image.dim() {
+        let row = from + FRAME_DIM + i;
+        *part.gradient(row) += by_image.column(i).dot(&seen.residual);
+        let sums = part.h.part_mut(row, from, with_state.nrows());
+        sums.iter_mut().zip(with_state.column(i).iter()).for_each(|(sum, value)| *sum += value);
+        (0..=i).for_each(|j| part.h.add(row, from + FRAME_DIM + j, square[(i, j)]));
+    }
+}
+
 /// The images' own part of taking a landmark out of the normal equations (Schur complement).
+#[inline(always)]
 pub(super) fn eliminate(
     problem: &Problem,
     block: &LandmarkBlock,
     inverse: &Matrix3<f64>,
     own_step: &Vector3<f64>,
-    system: &mut System,
+    part: &mut Part<'_>,
 ) {
     let unknowns = problem.prior.image.dim();
     let seen = |at: usize| {
-        let (frame, by_state) = &block.by_state[at];
-        (*frame, problem.offset(*frame), by_state, &block.by_image[at])
+        let ObservationBlock { frame, with_landmark, .. } = &block.observations[at];
+        (*frame, problem.offset(*frame), with_landmark, &block.images[at].with_landmark)
     };
-    for at in 0..block.by_image.len() {
+    for at in 0..block.images.len() {
         let (frame, from, by_state, by_image) = seen(at);
         let row = from + FRAME_DIM;
         let weighted: ByImage = inverse * by_image;
+        for k in part.calibrations.clone() {
+            for i in 0..unknowns {
+                let product = weighted.column(i).dot(&block.with_calibration[k]);
+                part.h.add(problem.calibration_offset() + k, row + i, -product);
+            }
+        }
+        if !part.frames.contains(&frame) {
+            continue;
+        }
         let weighted_state = product(by_state, inverse);
         for i in 0..unknowns {
-            system.gradient[row + i] -= by_image.column(i).dot(own_step);
+            *part.gradient(row + i) -= by_image.column(i).dot(own_step);
         }
         for (other_frame, other_from, other_state, other_image) in (0..=at).map(seen) {
             let with_state = other_state * weighted;
             let with_image = weighted.tr_mul(other_image);
             for i in 0..unknowns {
-                let sums = system.h.part_mut(row + i, other_from, with_state.nrows());
+                let sums = part.h.part_mut(row + i, other_from, with_state.nrows());
                 sums.iter_mut().zip(with_state.column(i).iter()).for_each(|(sum, value)| *sum -= value);
                 let others = if other_frame == frame { i + 1 } else { unknowns };
                 for j in 0..others {
-                    system.h.add(row + i, other_from + FRAME_DIM + j, -with_image[(i, j)]);
+                    part.h.add(row + i, other_from + FRAME_DIM + j, -with_image[(i, j)]);
                 }
             }
             if other_frame != frame {
                 let with_image = weighted_state * other_image;
                 for j in 0..unknowns {
                     for (k, value) in with_image.column(j).iter().enumerate() {
-                        system.h.add(from + k, other_from + FRAME_DIM + j, -value);
+                        part.h.add(from + k, other_from + FRAME_DIM + j, -value);
                     }
                 }
-            }
-        }
-        for (k, by_calibration) in block.by_calibration.iter().enumerate() {
-            for i in 0..unknowns {
-                let product = weighted.column(i).dot(by_calibration);
-                system.h.add(problem.calibration_offset() + k, row + i, -product);
             }
         }
     }

@@ -32,6 +32,7 @@ mod observation;
 mod optimise;
 mod problem;
 mod progress;
+mod reprojections;
 mod result;
 mod scale_step;
 mod sigmas;

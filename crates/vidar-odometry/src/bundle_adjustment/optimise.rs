@@ -6,12 +6,14 @@ use super::linearise::{Cost, cost, cost_with, inertial_error, landmark_cost, lin
 use super::observation::{MovingBody, SensorCalibration};
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
+use super::reprojections::LANDMARKS_AT_A_TIME;
 use super::scale_step::ScaleStep;
 use super::single_landmark;
 use super::system::System;
 use crate::backend::dot;
 use crate::imu::Vector15;
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use vidar_solve::levenberg_marquardt::{self, Decrease, Increase, LeastSquares, Limits, Schedule, Trial};
 
 /// Rounds of minimising and leaving out what does not fit.
@@ -223,19 +225,21 @@ impl Values {
         self.bodies.extend(problem.frames.iter().map(|f| f.body));
         self.landmarks.clear();
         self.landmarks.extend(problem.landmarks.iter().map(|l| l.landmark));
-        self.costs.clear();
-        self.costs.extend(problem.landmarks.iter().map(|l| landmark_cost(problem, l, &l.landmark)));
+        let landmarks = problem.landmarks.par_iter().with_min_len(LANDMARKS_AT_A_TIME);
+        landmarks.map(|l| landmark_cost(problem, l, &l.landmark)).collect_into_vec(&mut self.costs);
         self.calibration = Some(problem.calibration.clone());
     }
 
     /// Brings the landmarks that a step has made worse to where they fit the moved states; the cost of all.
     fn refine_worse(&self, problem: &mut Problem, scale: &ScaleStep) -> f64 {
+        let landmarks = problem.landmarks.par_iter().zip(self.landmarks.par_iter().zip(&self.costs));
+        let refined = landmarks.with_min_len(LANDMARKS_AT_A_TIME).map(|(seen, (before, cost))| {
+            single_landmark::refined(problem, seen, scale.scaled(before), *cost)
+        });
+        let refined: Vec<(Landmark, f64)> = refined.collect();
         let mut visual = 0.0;
-        for k in 0..problem.landmarks.len() {
-            let before = scale.scaled(&self.landmarks[k]);
-            let (landmark, cost) =
-                single_landmark::refined(problem, &problem.landmarks[k], before, self.costs[k]);
-            problem.landmarks[k].landmark = landmark;
+        for (seen, (landmark, cost)) in problem.landmarks.iter_mut().zip(refined) {
+            seen.landmark = landmark;
             visual += cost;
         }
         visual

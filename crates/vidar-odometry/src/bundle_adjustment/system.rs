@@ -5,7 +5,7 @@ use super::image_prior::IMAGE_DIM;
 use super::observation::STATE_DIM;
 use super::problem::{FRAME_DIM, Problem};
 use crate::backend::dot;
-use nalgebra::{Matrix3, SMatrix, Vector3};
+use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 
 /// `Jᵀ J` between the unknowns of a state and a landmark.
 pub(super) type ByState = SMatrix<f64, STATE_DIM, 3>;
@@ -13,17 +13,35 @@ pub(super) type ByState = SMatrix<f64, STATE_DIM, 3>;
 /// The same of a landmark and the unknowns of an image.
 pub(super) type ByImage = SMatrix<f64, 3, IMAGE_DIM>;
 
+/// What an observation adds, whitened.
+#[derive(Clone, Debug)]
+pub(super) struct ObservationBlock {
+    pub(super) frame: usize,
+    pub(super) residual: Vector2<f64>,
+    pub(super) by_state: SMatrix<f64, 2, STATE_DIM>,
+    pub(super) with_landmark: ByState,
+}
+
+/// What an observation adds for its image's own unknowns, as many columns as there are.
+#[derive(Clone, Debug)]
+pub(super) struct ImageBlock {
+    pub(super) by_image: SMatrix<f64, 2, IMAGE_DIM>,
+    pub(super) with_landmark: ByImage,
+}
+
 /// A landmark's block of the normal equations, kept to find its step from the states'.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LandmarkBlock {
     /// Inverse of the damped 3 × 3 block, by [`super::landmark::Landmark::inverse_of`]; `None` leaves the landmark where it is.
     pub(super) inverse: Option<Matrix3<f64>>,
     pub(super) gradient: Vector3<f64>,
-    /// Of each observation.
-    pub(super) by_state: Vec<(usize, ByState)>,
-    /// Of each observation with its image, as many columns as that has unknowns; none where it has none.
-    pub(super) by_image: Vec<ByImage>,
-    pub(super) by_calibration: Vec<Vector3<f64>>,
+    pub(super) observations: Vec<ObservationBlock>,
+    /// Of each observation, where images have unknowns; else none.
+    pub(super) images: Vec<ImageBlock>,
+    /// Derivatives of each observation by the active unknowns of the camera, one observation after the other.
+    pub(super) by_calibration: Vec<Vector2<f64>>,
+    /// `Jᵀ J` of the landmark and each of them.
+    pub(super) with_calibration: Vec<Vector3<f64>>,
 }
 
 /// The reduced normal equations `H x = −g` of states and calibration.
@@ -49,6 +67,24 @@ impl System {
 }
 
 impl LandmarkBlock {
+    /// Without observations.
+    pub(super) fn clear(&mut self, calibrations: usize) {
+        self.inverse = None;
+        self.gradient = Vector3::zeros();
+        self.observations.clear();
+        self.images.clear();
+        self.by_calibration.clear();
+        self.with_calibration.clear();
+        self.with_calibration.resize(calibrations, Vector3::zeros());
+    }
+
+    /// Derivatives of an observation by the active unknowns of the camera.
+    #[inline(always)]
+    pub(super) fn by_calibration(&self, at: usize) -> &[Vector2<f64>] {
+        let count = self.with_calibration.len();
+        &self.by_calibration[count * at..count * (at + 1)]
+    }
+
     /// Standard deviation of the inverse distance with the states held, 1/m; infinite where it is at its bound.
     pub(super) fn inverse_distance_sigma(&self) -> f64 {
         let variance = self.inverse.map(|inverse| inverse[(2, 2)]).filter(|variance| *variance > 0.0);
@@ -63,17 +99,18 @@ impl LandmarkBlock {
         calibration_offset: usize,
     ) -> Option<Vector3<f64>> {
         let mut gradient = self.gradient;
-        for (at, (frame, by_state)) in self.by_state.iter().enumerate() {
-            let from = frame_dim * frame;
-            if let Some(by_image) = self.by_image.get(at) {
-                for (column, moved) in by_image.column_iter().zip(&step[from + FRAME_DIM..from + frame_dim]) {
+        for (at, seen) in self.observations.iter().enumerate() {
+            let from = frame_dim * seen.frame;
+            if let Some(image) = self.images.get(at) {
+                let columns = image.with_landmark.column_iter();
+                for (column, moved) in columns.zip(&step[from + FRAME_DIM..from + frame_dim]) {
                     gradient += column * *moved;
                 }
             }
             let moved = SMatrix::<f64, STATE_DIM, 1>::from_column_slice(&step[from..from + STATE_DIM]);
-            gradient += by_state.transpose() * moved;
+            gradient += seen.with_landmark.transpose() * moved;
         }
-        for (by_calibration, moved) in self.by_calibration.iter().zip(&step[calibration_offset..]) {
+        for (by_calibration, moved) in self.with_calibration.iter().zip(&step[calibration_offset..]) {
             gradient += by_calibration * *moved;
         }
         Some(-(self.inverse? * gradient))

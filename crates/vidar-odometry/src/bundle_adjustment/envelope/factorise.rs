@@ -5,13 +5,6 @@ use crate::backend::dot;
 use std::ops::Range;
 use vidar_core::simd::kernel;
 
-kernel! {
-    /// Replaces a matrix, with `extra` on its diagonal, by its factor; whether it is positive definite.
-    pub(super) fn factorise_rows(matrix: &mut Envelope, extra: &[f64]) -> bool {
-        matrix.factorise_in_place(extra)
-    }
-}
-
 /// Rows that are factorised together where they begin at one column, so that what is above is loaded once for all: three times so many are those of
 /// a state.
 const TOGETHER: usize = 5;
@@ -21,96 +14,182 @@ const TOGETHER: usize = 5;
 const PANEL: usize = 30;
 const BLOCK: usize = 16;
 
-impl Envelope {
-    /// Each entry is found as row by row, from the same products in the same order.
+/// Products before a panel from which its groups of rows are worth threads: some 30 µs of work.
+const WORTH_THREADS: usize = 200_000;
+
+/// Replaces a matrix, with `extra` on its diagonal, by its factor; whether it is positive definite. Each entry is found as row by row, from the same products in
+/// the same order, by however many threads.
+pub(super) fn factorise_rows(matrix: &mut Envelope, extra: &[f64]) -> bool {
+    let Envelope { first, begin, values } = matrix;
+    let shape = Shape { first, begin };
+    let dim = first.len();
+    (0..dim).step_by(PANEL).all(|panel| {
+        let rows = panel..dim.min(panel + PANEL);
+        let (above, own) = values.split_at_mut(begin[panel]);
+        let own = &mut own[..begin[rows.end] - begin[panel]];
+        let groups = shape.groups(rows.clone());
+        let reach: usize = rows.clone().map(|row| panel.saturating_sub(first[row])).sum();
+        let threads =
+            if reach * reach / (2 * rows.len()) < WORTH_THREADS { 1 } else { rayon::current_num_threads() };
+        solve_by_threads(shape, above, panel, &groups, groups.len().div_ceil(threads), own);
+        finish_panel(shape, panel, &groups, own, extra)
+    })
+}
+
+/// Entries of a panel's rows in the columns before it, in parts of at most `part` groups.
+fn solve_by_threads(
+    shape: Shape<'_>,
+    above: &[f64],
+    panel: usize,
+    groups: &[Range<usize>],
+    part: usize,
+    rows: &mut [f64],
+) {
+    if groups.len() <= part {
+        return solve_left(shape, above, panel, groups, rows);
+    }
+    let (here, there) = groups.split_at(part);
+    let (mine, others) = rows.split_at_mut(shape.begin[there[0].start] - shape.begin[here[0].start]);
+    rayon::join(
+        || solve_left(shape, above, panel, here, mine),
+        || solve_by_threads(shape, above, panel, there, part, others),
+    );
+}
+
+kernel! {
+    /// Entries of groups of rows, which `rows` begin with, in the columns before `panel`, where `above` ends.
+    fn solve_left(shape: Shape<'_>, above: &[f64], panel: usize, groups: &[Range<usize>], rows: &mut [f64]) {
+        shape.solve_left(above, panel, groups, rows);
+    }
+}
+
+kernel! {
+    /// The other entries of a panel, which `rows` are; whether all its pivots are positive.
+    fn finish_panel(shape: Shape<'_>, panel: usize, groups: &[Range<usize>], rows: &mut [f64], extra: &[f64]) -> bool {
+        shape.finish_panel(panel, groups, rows, extra)
+    }
+}
+
+/// Where the rows of an envelope begin.
+#[derive(Clone, Copy)]
+struct Shape<'a> {
+    first: &'a [usize],
+    begin: &'a [usize],
+}
+
+/// Rows above those that are solved, from row `from` on.
+#[derive(Clone, Copy)]
+struct Above<'a> {
+    values: &'a [f64],
+    from: usize,
+}
+
+impl Shape<'_> {
+    /// Rows that are solved together.
+    fn groups(&self, rows: Range<usize>) -> Vec<Range<usize>> {
+        let mut groups = Vec::new();
+        let mut row = rows.start;
+        while row < rows.end {
+            let alike =
+                (row..rows.end.min(row + TOGETHER)).take_while(|k| self.first[*k] == self.first[row]).count();
+            groups.push(row..row + alike);
+            row += alike;
+        }
+        groups
+    }
+
     #[inline(always)]
-    fn factorise_in_place(&mut self, extra: &[f64]) -> bool {
-        let dim = self.dim();
-        for panel in (0..dim).step_by(PANEL) {
-            let end = dim.min(panel + PANEL);
-            let mut block = self.first[panel..end].iter().copied().min().unwrap_or(panel) / BLOCK * BLOCK;
-            while block < panel {
-                let columns = block..panel.min(block + BLOCK);
-                let mut row = panel;
-                while row < end {
-                    row = self.solve(row, end, columns.clone());
-                }
-                block += BLOCK;
+    fn solve_left(&self, above: &[f64], panel: usize, groups: &[Range<usize>], rows: &mut [f64]) {
+        let above = Above { values: above, from: 0 };
+        let (Some(first), Some(last)) = (groups.first(), groups.last()) else { return };
+        let mut block = panel;
+        for row in first.start..last.end {
+            block = block.min(self.first[row]);
+        }
+        block = block / BLOCK * BLOCK;
+        while block < panel {
+            let columns = block..panel.min(block + BLOCK);
+            for group in groups {
+                let own = &mut rows[self.begin[group.start] - self.begin[first.start]..];
+                self.solve(above, group, columns.clone(), own);
             }
-            let mut row = panel;
-            while row < end {
-                let until = self.solve(row, end, panel..row);
-                for i in row..until {
-                    if !self.finish_row(i, row, extra[i]) {
-                        return false;
-                    }
+            block += BLOCK;
+        }
+    }
+
+    #[inline(always)]
+    fn finish_panel(&self, panel: usize, groups: &[Range<usize>], rows: &mut [f64], extra: &[f64]) -> bool {
+        for group in groups {
+            let (before, own) = rows.split_at_mut(self.begin[group.start] - self.begin[panel]);
+            self.solve(Above { values: before, from: panel }, group, panel..group.start, own);
+            for row in group.clone() {
+                let (before, own) = rows.split_at_mut(self.begin[row] - self.begin[panel]);
+                if !self.finish_row(Above { values: before, from: panel }, row, group.start, own, extra[row])
+                {
+                    return false;
                 }
-                row = until;
             }
         }
         true
     }
 
-    /// Entries in some columns of the row, and of those after it that are solved together with it; where those end.
+    /// Entries of a row from `column` on; whether its pivot is positive.
     #[inline(always)]
-    fn solve(&mut self, row: usize, end: usize, columns: Range<usize>) -> usize {
+    fn finish_row(&self, above: Above<'_>, row: usize, column: usize, own: &mut [f64], extra: f64) -> bool {
         let first = self.first[row];
-        let mut until = row + 1;
-        while until < end && until < row + TOGETHER && self.first[until] == first {
-            until += 1;
-        }
-        let columns = first.max(columns.start)..columns.end;
-        if until == row + TOGETHER {
-            self.solve_together(row, columns);
+        self.solve_row(above, row, first.max(column)..row, own);
+        let (left, last) = own[..row + 1 - first].split_at_mut(row - first);
+        let pivot = last[0] + extra - dot(left, left);
+        last[0] = pivot.sqrt();
+        // A NaN must fail, too.
+        pivot > 0.0 && pivot.is_finite()
+    }
+
+    /// Entries in some columns of a group of rows, which `rows` begin with.
+    #[inline(always)]
+    fn solve(&self, above: Above<'_>, group: &Range<usize>, columns: Range<usize>, rows: &mut [f64]) {
+        let columns = columns.start.max(self.first[group.start])..columns.end;
+        if group.len() == TOGETHER {
+            self.solve_together(above, group.start, columns, rows);
         } else {
-            for i in row..until {
-                self.solve_row(i, columns.clone());
+            for row in group.clone() {
+                self.solve_row(
+                    above,
+                    row,
+                    columns.clone(),
+                    &mut rows[self.begin[row] - self.begin[group.start]..],
+                );
             }
         }
-        until
     }
 
     #[inline(always)]
-    fn solve_together(&mut self, row: usize, columns: Range<usize>) {
+    fn solve_together(&self, above: Above<'_>, row: usize, columns: Range<usize>, rows: &mut [f64]) {
         let first = self.first[row];
-        let (above, rows) = self.values.split_at_mut(self.begin[row]);
         let mut starts = [0; TOGETHER];
         for k in 0..TOGETHER {
             starts[k] = self.begin[row + k] - self.begin[row];
         }
         for j in columns {
             let from = first.max(self.first[j]);
-            let end = self.begin[j + 1] - 1;
-            let known = dots(rows, &starts, from - first, &above[end + from - j..end]);
+            let end = self.begin[j + 1] - self.begin[above.from] - 1;
+            let known = dots(rows, &starts, from - first, &above.values[end + from - j..end]);
             for k in 0..TOGETHER {
                 let entry = &mut rows[starts[k] + j - first];
-                *entry = (*entry - known[k]) / above[end];
+                *entry = (*entry - known[k]) / above.values[end];
             }
         }
     }
 
     #[inline(always)]
-    fn solve_row(&mut self, row: usize, columns: Range<usize>) {
+    fn solve_row(&self, above: Above<'_>, row: usize, columns: Range<usize>, own: &mut [f64]) {
         let first = self.first[row];
-        let (above, rest) = self.values.split_at_mut(self.begin[row]);
         for j in columns {
             let from = first.max(self.first[j]);
-            let end = self.begin[j + 1] - 1;
-            let known = dot(&rest[from - first..j - first], &above[end + from - j..end]);
-            rest[j - first] = (rest[j - first] - known) / above[end];
+            let end = self.begin[j + 1] - self.begin[above.from] - 1;
+            let known = dot(&own[from - first..j - first], &above.values[end + from - j..end]);
+            own[j - first] = (own[j - first] - known) / above.values[end];
         }
-    }
-
-    /// Entries of a row from `column` on; whether its pivot is positive.
-    #[inline(always)]
-    fn finish_row(&mut self, row: usize, column: usize, extra: f64) -> bool {
-        let first = self.first[row];
-        self.solve_row(row, first.max(column)..row);
-        let (left, last) = self.values[self.begin[row]..self.begin[row + 1]].split_at_mut(row - first);
-        let pivot = last[0] + extra - dot(left, left);
-        last[0] = pivot.sqrt();
-        // A NaN must fail, too.
-        pivot > 0.0 && pivot.is_finite()
     }
 }
 
@@ -189,26 +268,49 @@ mod tests {
     }
 
     /// States of fifteen rows that reach back by different lengths, some rows by themselves, and a border.
-    #[test]
-    fn rows_that_are_taken_together_have_the_bits_of_rows_by_themselves() {
-        let back = [0, 0, 1, 2, 4, 1, 3, 7, 2, 0];
-        let mut first: Vec<usize> = (0..150).map(|i| 15 * (i / 15 - back[i / 15])).collect();
-        first.extend([40, 41, 41, 90, 90, 90, 90, 90, 3]);
+    fn example(back: impl Fn(usize) -> usize, states: usize) -> Envelope {
+        let mut first: Vec<usize> = (0..15 * states).map(|i| 15 * (i / 15 - back(i / 15))).collect();
+        let some = 15 * (states / 2);
+        first.extend([40, 41, 41, some, some, some, some, some, 3]);
         first.extend([0; 8]);
         let mut matrix = Envelope::new(first.clone());
         for (i, first) in first.iter().enumerate() {
             for j in *first..=i {
-                matrix.add(i, j, if i == j { 200.0 } else { ((3 * i + 7 * j) as f64).sin() });
+                matrix.add(i, j, if i == j { 900.0 } else { ((3 * i + 7 * j) as f64).sin() });
             }
         }
-        let extra: Vec<f64> = (0..matrix.dim()).map(|i| (i as f64).cos().abs()).collect();
+        matrix
+    }
+
+    fn damping(matrix: &Envelope) -> Vec<f64> {
+        (0..matrix.dim()).map(|i| (i as f64).cos().abs()).collect()
+    }
+
+    #[test]
+    fn rows_that_are_taken_together_have_the_bits_of_rows_by_themselves() {
+        let mut matrix = example(|state| [0, 0, 1, 2, 4, 1, 3, 7, 2, 0][state], 10);
+        let extra = damping(&matrix);
         let expected = by_rows(&matrix, &extra);
         with_each_instruction_set(|| {
             let mut factor = matrix.clone();
             assert!(matrix.factorise(&extra, &mut factor));
             assert_eq!(factor.values, expected.values);
         });
-        matrix.add(100, 100, -300.0);
+        matrix.add(100, 100, -1800.0);
         assert!(!matrix.factorise(&extra, &mut matrix.clone()));
+    }
+
+    /// Of 50 states that reach back over up to 40: enough for threads.
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let matrix = example(|state| state.min(40 - state % 3), 50);
+        let extra = damping(&matrix);
+        let expected = by_rows(&matrix, &extra);
+        for threads in [1, 2, 3, 5, 16] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut factor = matrix.clone();
+            assert!(pool.install(|| matrix.factorise(&extra, &mut factor)));
+            assert!(factor.values == expected.values, "{threads} threads");
+        }
     }
 }

@@ -50,7 +50,8 @@ impl Envelope {
             let [low, high] = &products;
             for (at, row) in below.rows().filter(|(_, row)| self.first[*row] <= columns.start) {
                 let found = low.sums[at].iter().chain(&high.sums[at]);
-                let target = z.part_mut(row, columns.start, columns.len());
+                let mut rows = z.rows();
+                let target = rows.part_mut(row, columns.start, columns.len());
                 target.iter_mut().zip(found).for_each(|(z, sum)| *z = -sum);
             }
             let own = factor.inverse_of_square();
