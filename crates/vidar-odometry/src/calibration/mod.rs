@@ -16,6 +16,7 @@ mod parameters;
 mod path;
 mod solve;
 mod stretches;
+mod template;
 #[cfg(test)]
 mod tests;
 mod tracker;

@@ -20,15 +20,15 @@ pub(super) struct GyroPath {
 
 /// The path at one time.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct PathPoint {
+pub(super) struct PathPoint<'a> {
+    path: &'a GyroPath,
+    /// The sample before, and how much later this is, s.
+    sample: usize,
+    late: f64,
     /// first_from_body.
     pub rotation: Matrix3<f64>,
     /// Corrected angular rate in body axes, rad/s.
     pub rate: Vector3<f64>,
-    /// ∫ R dt, s: minus the derivative of a left rotation by the bias.
-    pub bias_integral: Matrix3<f64>,
-    /// ∫ R diag(ω) dt: the derivative of a left rotation by the scales.
-    pub scale_integral: Matrix3<f64>,
 }
 
 impl GyroPath {
@@ -64,18 +64,27 @@ impl GyroPath {
     }
 
     /// The path at a time; outside of the samples the nearest rate continues.
-    pub fn at(&self, secs: f64) -> PathPoint {
+    pub fn at(&self, secs: f64) -> PathPoint<'_> {
         let after = self.secs.partition_point(|s| *s <= secs);
         let k = after.saturating_sub(1).min(self.secs.len().saturating_sub(2));
         let step = secs - self.secs[k];
         let rate = self.rates[k];
-        let start = self.orientations[k].matrix();
-        PathPoint {
-            rotation: (self.orientations[k] * So3::exp(&(rate * step))).matrix(),
-            rate,
-            bias_integral: self.bias_integrals[k] + start * step,
-            scale_integral: self.scale_integrals[k]
-                + start * Matrix3::from_diagonal(&self.measured[k]) * step,
-        }
+        let rotation = (self.orientations[k] * So3::exp(&(rate * step))).matrix();
+        PathPoint { path: self, sample: k, late: step, rotation, rate }
+    }
+}
+
+impl PathPoint<'_> {
+    /// ∫ R dt, s: minus the derivative of a left rotation by the bias.
+    pub fn bias_integral(&self) -> Matrix3<f64> {
+        let start = self.path.orientations[self.sample].matrix();
+        self.path.bias_integrals[self.sample] + start * self.late
+    }
+
+    /// ∫ R diag(ω) dt: the derivative of a left rotation by the scales.
+    pub fn scale_integral(&self) -> Matrix3<f64> {
+        let start = self.path.orientations[self.sample].matrix();
+        let measured = Matrix3::from_diagonal(&self.path.measured[self.sample]);
+        self.path.scale_integrals[self.sample] + start * measured * self.late
     }
 }

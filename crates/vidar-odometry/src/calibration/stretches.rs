@@ -96,7 +96,7 @@ fn stretch(size: (f64, f64), images: &[ImageFeatures]) -> Option<Window> {
         .map(|(_, k)| Point {
             direction: Vector3::z(),
             inverse_distance: 1.0,
-            observations: std::mem::take(&mut tracks[k].1),
+            observations: std::mem::take(&mut tracks[k].1).into(),
         })
         .collect();
     let nodes = images

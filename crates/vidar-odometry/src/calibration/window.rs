@@ -8,11 +8,13 @@
 //! eliminated by Schur complements.
 
 mod elimination;
+mod sums;
 mod turns;
 
 use super::parameters::{DIM, Parameters, Projection, Tangent};
 use super::path::{GyroPath, PathPoint};
 use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, Vector2, Vector3};
+use std::sync::Arc;
 use turns::{SHAKES, Shakes, turn_and_shift};
 pub(super) use turns::{Turns, rms_per_axis, shift_sigma};
 use vidar_core::camera::Pixel;
@@ -21,8 +23,10 @@ use vidar_solve::Kernel;
 
 /// Unknowns of an image: rotation by which the gyroscope's is wrong, position.
 const NODE: usize = 6;
-/// Columns of one observation: its image's rotation, three positions, the parameters, the shares of a stabiliser.
-const TOUCHED: usize = 3 + 9 + DIM + SHAKES;
+/// Unknowns of images that an observation depends on: its image's rotation, three positions.
+const OF_NODES: usize = 3 + 9;
+/// All of them: those, the shares of a stabiliser, the parameters.
+const TOUCHED: usize = OF_NODES + SHAKES + DIM;
 
 /// Residuals beyond this many standard deviations lose weight.
 const KERNEL: Kernel = Kernel::Cauchy { k: 2.0 };
@@ -49,7 +53,8 @@ pub(super) struct NodeObservation {
 pub(super) struct Point {
     pub direction: Vector3<f64>,
     pub inverse_distance: f64,
-    pub observations: Vec<NodeObservation>,
+    /// Shared by the solutions that are tried.
+    pub observations: Arc<[NodeObservation]>,
 }
 
 /// One image of the stretch.
@@ -105,13 +110,13 @@ struct PointBlock {
 }
 
 /// The geometry of one observation.
-struct Seen {
+struct Seen<'a> {
     /// camera_from_reference.
     turn: Matrix3<f64>,
     /// From the camera's position to the point, times the inverse distance, in the reference's axes.
     ray: Vector3<f64>,
     in_camera: Vector3<f64>,
-    path: PathPoint,
+    path: PathPoint<'a>,
     /// Rotation by which the gyroscope's is wrong.
     drift: Matrix3<f64>,
     /// Time of its row after its image's, s.
@@ -123,7 +128,7 @@ struct Seen {
     near: [(usize, f64, f64); 3],
 }
 
-impl Seen {
+impl Seen<'_> {
     /// Where it shows in the picture.
     fn shown(&self, projection: &Projection) -> Pixel {
         projection.pixel + self.shift
@@ -134,10 +139,11 @@ impl Window {
     /// The robust cost.
     pub fn cost(&self, parameters: &Parameters, path: &GyroPath, noise: &Noise) -> f64 {
         let reference = path.at(self.nodes[self.reference].secs + parameters.offset_secs);
+        let drifts = self.drifts();
         let mut cost = self.prior_cost(noise);
         for point in &self.points {
-            for seen in &point.observations {
-                let at = self.see(point, seen, parameters, path, &reference);
+            for seen in point.observations.iter() {
+                let at = self.see(point, seen, parameters, path, &reference, &drifts);
                 let e2 = parameters.project(&at.in_camera).map_or(INVALID * INVALID, |p| {
                     ((seen.pixel - at.shown(&p)) / noise.pixel).norm_squared()
                 });
@@ -150,35 +156,43 @@ impl Window {
     /// All residuals in pixels, those that cannot be predicted left out.
     pub fn residuals(&self, parameters: &Parameters, path: &GyroPath) -> Vec<Vector2<f64>> {
         let reference = path.at(self.nodes[self.reference].secs + parameters.offset_secs);
+        let drifts = self.drifts();
         let all = self.points.iter().flat_map(|p| p.observations.iter().map(move |o| (p, o)));
         all.filter_map(|(point, seen)| {
-            let at = self.see(point, seen, parameters, path, &reference);
+            let at = self.see(point, seen, parameters, path, &reference, &drifts);
             Some(seen.pixel - at.shown(&parameters.project(&at.in_camera)?))
         })
         .collect()
     }
 
-    fn see(
+    /// Rotations of the nodes' drifts; none where a stabiliser is looked for, whose rows have turns of their own.
+    fn drifts(&self) -> Vec<Matrix3<f64>> {
+        let nodes = if self.shakes.is_some() { &[] } else { &self.nodes[..] };
+        nodes.iter().map(|node| So3::exp(&node.drift).matrix()).collect()
+    }
+
+    fn see<'a>(
         &self,
         point: &Point,
         seen: &NodeObservation,
         parameters: &Parameters,
-        path: &GyroPath,
-        reference: &PathPoint,
-    ) -> Seen {
+        path: &'a GyroPath,
+        reference: &PathPoint<'_>,
+        drifts: &[Matrix3<f64>],
+    ) -> Seen<'a> {
         let node = &self.nodes[seen.node];
         let late = seen.row * parameters.readout_secs;
         let at = path.at(node.secs + parameters.offset_secs + late);
         let body_from_camera = parameters.body_from_camera.matrix();
         let reference_from_camera = reference.rotation.transpose() * at.rotation * body_from_camera;
-        let [turns, shifts] = match &self.shakes {
+        let (drift, shifts) = match &self.shakes {
             Some(shakes) => {
                 let drift = node.drift - shakes.taken_back(seen.node, late);
-                turn_and_shift(&drift, &reference_from_camera)
+                let [turns, shifts] = turn_and_shift(&drift, &reference_from_camera);
+                (So3::exp(&turns).matrix(), shifts)
             }
-            None => [node.drift, Vector3::zeros()],
+            None => (drifts[seen.node], Vector3::zeros()),
         };
-        let drift = So3::exp(&turns).matrix();
         let turn = (drift * reference_from_camera).transpose();
         // Turned about the camera's x a camera would see things move down, about its y to the left.
         let moved = turn * shifts;

@@ -1,8 +1,9 @@
 //! Linearises a stretch and eliminates its own unknowns: points, then images.
 
+use super::sums::{Linear, NormalEquations};
 use super::{
-    BackSubstitution, FIXED, INVERSE_DISTANCE_PRIOR, KERNEL, NODE, NodeObservation, Noise, POSITION_PRIOR,
-    Point, PointBlock, Reduced, SHAKES, Seen, TOUCHED, Window, turns::by_turn_and_shift,
+    BackSubstitution, FIXED, INVERSE_DISTANCE_PRIOR, KERNEL, NODE, NodeObservation, Noise, OF_NODES,
+    POSITION_PRIOR, Point, PointBlock, Reduced, SHAKES, Seen, TOUCHED, Window, turns::by_turn_and_shift,
 };
 use crate::calibration::parameters::{BIAS, Projection};
 use crate::calibration::parameters::{
@@ -10,14 +11,6 @@ use crate::calibration::parameters::{
 };
 use crate::calibration::path::{GyroPath, PathPoint};
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
-
-/// A residual with its derivatives, whitened.
-struct Linear {
-    residual: Vector2<f64>,
-    columns: [usize; TOUCHED],
-    jacobian: SMatrix<f64, 2, TOUCHED>,
-    d_point: SMatrix<f64, 2, 3>,
-}
 
 impl Window {
     /// Linearises and eliminates; `damping` is Levenberg and Marquardt's factor on the diagonal. `None` where a block has no
@@ -30,37 +23,24 @@ impl Window {
         damping: f64,
     ) -> Option<Reduced> {
         let own = self.own_unknowns();
-        let all = own + DIM;
-        let mut h = DMatrix::<f64>::zeros(all, all);
-        let mut g = DVector::<f64>::zeros(all);
+        let mut sums = NormalEquations::new(own, self.shakes.is_some());
         let reference = path.at(self.nodes[self.reference].secs + parameters.offset_secs);
-        self.add_position_priors(&mut h, &mut g);
-        self.add_turns(&mut h, &mut g, &noise.turns);
+        self.add_position_priors(&mut sums.h, &mut sums.g);
+        self.add_turns(&mut sums.h, &mut sums.g, &noise.turns);
+        let drifts = self.drifts();
         let mut blocks = Vec::with_capacity(self.points.len());
-        // Shares that nothing is taken back of have no derivative.
-        let touched = if self.shakes.is_some() { TOUCHED } else { TOUCHED - SHAKES };
         for point in &self.points {
             let tangents = tangents(&point.direction);
             let weight = 1.0 / (INVERSE_DISTANCE_PRIOR * INVERSE_DISTANCE_PRIOR);
             let mut block = Matrix3::from_diagonal(&Vector3::new(1e-6, 1e-6, weight));
             let mut gradient = Vector3::new(0.0, 0.0, weight * (1.0 - point.inverse_distance));
-            let mut coupling = DMatrix::<f64>::zeros(all, 3);
-            for seen in &point.observations {
-                let at = self.see(point, seen, parameters, path, &reference);
+            let mut coupling = sums.no_coupling();
+            for seen in point.observations.iter() {
+                let at = self.see(point, seen, parameters, path, &reference, &drifts);
                 let Some(projection) = parameters.project(&at.in_camera) else { continue };
                 let linear = self.linearise(point, seen, &at, &projection, &reference, &tangents, noise);
                 let w = KERNEL.weight(linear.residual.norm_squared());
-                let weighted = linear.jacobian * w;
-                for (a, &column) in linear.columns[..touched].iter().enumerate() {
-                    g[column] += weighted.column(a).dot(&linear.residual);
-                    for p in 0..3 {
-                        coupling[(column, p)] += weighted.column(a).dot(&linear.d_point.column(p));
-                    }
-                    for (b, &other) in linear.columns[..touched].iter().enumerate().skip(a) {
-                        let value = weighted.column(a).dot(&linear.jacobian.column(b));
-                        h[(column.max(other), column.min(other))] += value;
-                    }
-                }
+                sums.add(&linear, w, &mut coupling);
                 block += linear.d_point.transpose() * linear.d_point * w;
                 gradient += linear.d_point.transpose() * linear.residual * w;
             }
@@ -68,9 +48,10 @@ impl Window {
                 block[(p, p)] *= 1.0 + damping;
             }
             let inverse = block.try_inverse()?;
-            eliminate(&mut h, &mut g, &coupling, &inverse, &gradient);
+            sums.eliminate(&coupling, &inverse, &gradient);
             blocks.push(PointBlock { inverse, gradient, coupling, tangents });
         }
+        let NormalEquations { mut h, g, .. } = sums;
         for k in 0..own {
             h[(k, k)] *= 1.0 + damping;
         }
@@ -108,13 +89,12 @@ impl Window {
         &self,
         point: &Point,
         seen: &NodeObservation,
-        at: &Seen,
+        at: &Seen<'_>,
         projection: &Projection,
-        reference: &PathPoint,
+        reference: &PathPoint<'_>,
         tangents: &[Vector3<f64>; 2],
         noise: &Noise,
     ) -> Linear {
-        let own = self.own_unknowns();
         let by_sigma = 1.0 / noise.pixel;
         let d_camera: Matrix2x3<f64> = projection.d_point * by_sigma;
         let d_ray: Matrix2x3<f64> = d_camera * at.turn;
@@ -123,15 +103,12 @@ impl Window {
         let from_first = at.drift * reference.rotation.transpose();
         let rate = from_first * at.path.rotation * at.path.rate;
         let mut jacobian = SMatrix::<f64, 2, TOUCHED>::zeros();
-        let mut columns = [0; TOUCHED];
+        let mut columns = [0; OF_NODES];
         for a in 0..3 {
             columns[a] = NODE * seen.node + a;
             for (n, (node, ..)) in at.near.iter().enumerate() {
                 columns[3 + 3 * n + a] = NODE * node + 3 + a;
             }
-        }
-        for p in 0..DIM {
-            columns[12 + p] = own + p;
         }
         let (mut d_drift, mut d_taken_back) = (d_turn, Vector2::zeros());
         if let Some(shakes) = &self.shakes {
@@ -139,8 +116,7 @@ impl Window {
             d_drift = by_turn_and_shift(&d_turn, &(d_shift * (at.focal * by_sigma)), &at.turn);
             d_taken_back = d_drift * shakes.taken_back(seen.node, 1.0);
             for (j, rate) in shakes.rates(seen.node).iter().enumerate() {
-                columns[12 + DIM + j] = own - SHAKES + j;
-                jacobian.column_mut(12 + DIM + j).copy_from(&(d_drift * rate * -at.late));
+                jacobian.column_mut(OF_NODES + j).copy_from(&(d_drift * rate * -at.late));
             }
         }
         jacobian.fixed_columns_mut::<3>(0).copy_from(&d_drift);
@@ -150,7 +126,7 @@ impl Window {
             jacobian.fixed_columns_mut::<3>(3 + 3 * n).copy_from(&block);
             velocity += self.nodes[*node].position * *slope;
         }
-        let first = 12;
+        let first = OF_NODES + SHAKES;
         jacobian.fixed_columns_mut::<LENS>(first + FOCAL).copy_from(&(projection.d_lens * by_sigma));
         let mut d_focal = jacobian.column_mut(first + FOCAL);
         d_focal += at.shift * by_sigma;
@@ -161,9 +137,9 @@ impl Window {
         jacobian
             .fixed_columns_mut::<3>(first + ROTATION)
             .copy_from(&(d_camera * at.in_camera.cross_matrix()));
-        let by_bias = from_first * (reference.bias_integral - at.path.bias_integral);
+        let by_bias = from_first * (reference.bias_integral() - at.path.bias_integral());
         jacobian.fixed_columns_mut::<3>(first + BIAS).copy_from(&(d_turn * by_bias));
-        let by_scale = from_first * (at.path.scale_integral - reference.scale_integral);
+        let by_scale = from_first * (at.path.scale_integral() - reference.scale_integral());
         jacobian.fixed_columns_mut::<3>(first + SCALE).copy_from(&(d_turn * by_scale));
         let mut d_point = SMatrix::<f64, 2, 3>::zeros();
         d_point.column_mut(0).copy_from(&(d_ray * tangents[0]));
@@ -195,32 +171,6 @@ impl Window {
             let direction = point.direction + block.tangents[0] * moved.x + block.tangents[1] * moved.y;
             point.direction = direction.normalize();
             point.inverse_distance += moved.z;
-        }
-    }
-}
-
-/// Takes a point with block inverse `inverse` and coupling out of `H δ = g` (lower triangle).
-fn eliminate(
-    h: &mut DMatrix<f64>,
-    g: &mut DVector<f64>,
-    coupling: &DMatrix<f64>,
-    inverse: &Matrix3<f64>,
-    gradient: &Vector3<f64>,
-) {
-    let product = coupling * inverse;
-    *g -= &product * gradient;
-    let n = h.nrows();
-    let (a, b, c) = (coupling.column(0), coupling.column(1), coupling.column(2));
-    for column in 0..n {
-        let (x, y, z) = (product[(column, 0)], product[(column, 1)], product[(column, 2)]);
-        if x == 0.0 && y == 0.0 && z == 0.0 {
-            continue;
-        }
-        let mut target = h.column_mut(column);
-        let target = &mut target.as_mut_slice()[column..];
-        let (a, b, c) = (&a.as_slice()[column..], &b.as_slice()[column..], &c.as_slice()[column..]);
-        for (t, ((a, b), c)) in target.iter_mut().zip(a.iter().zip(b).zip(c)) {
-            *t -= a * x + b * y + c * z;
         }
     }
 }
