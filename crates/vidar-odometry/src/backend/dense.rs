@@ -1,6 +1,8 @@
 //! Dense linear algebra on preallocated slices: a Cholesky factorisation that skips leading zeros of its rows, and
 //! Householder QR of tall matrices.
 
+use vidar_core::simd::kernel;
+
 /// Dot product with eight independent sums: vectorises, and adds in one fixed order.
 #[inline(always)]
 pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
@@ -50,6 +52,11 @@ impl Cholesky {
     /// Factorises `a + diag(extra)`, `a` row-major `n × n` of which the lower triangle from column `first[i]` of each
     /// row is read. `false` when a pivot is not positive; the factor is of no use then.
     pub(crate) fn factorise(&mut self, a: &[f64], extra: &[f64], first: &[usize]) -> bool {
+        factorise_rows(self, a, extra, first)
+    }
+
+    #[inline(always)]
+    fn factorise_rows(&mut self, a: &[f64], extra: &[f64], first: &[usize]) -> bool {
         let n = first.len();
         self.n = n;
         self.first.clear();
@@ -120,6 +127,12 @@ impl Cholesky {
     pub(crate) fn solve(&self, b: &mut [f64]) {
         self.forward(b);
         self.backward(b);
+    }
+}
+
+kernel! {
+    fn factorise_rows(factor: &mut Cholesky, a: &[f64], extra: &[f64], first: &[usize]) -> bool {
+        factor.factorise_rows(a, extra, first)
     }
 }
 
