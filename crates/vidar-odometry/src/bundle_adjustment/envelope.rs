@@ -4,19 +4,23 @@
 //! full rows for the calibration: factorising it costs the square of the band's width per row, and the factor fills nothing
 //! outside the envelope (George and Liu 1981, chapter 4). A loop makes the rows of the states that it constrains long, and no others.
 
+mod aligned;
 mod factorise;
 mod inverse;
+mod lines;
 
 use crate::backend::dot;
+use aligned::{Aligned, LINE};
 
 /// Lower triangle of a symmetric matrix, or its Cholesky factor.
 #[derive(Clone, Debug)]
 pub(super) struct Envelope {
-    /// First stored column of every row.
+    /// First column of every row.
     first: Vec<usize>,
-    /// Where every row begins in `values`; one more than there are rows.
+    /// Where every row begins in `values`; one more than there are rows. Column 0, 8, 16, … of a row begins a line of the cache; what a row's lines hold before its
+    /// first column is zero.
     begin: Vec<usize>,
-    values: Vec<f64>,
+    values: Aligned,
 }
 
 impl Envelope {
@@ -25,11 +29,11 @@ impl Envelope {
         let mut begin = Vec::with_capacity(first.len() + 1);
         let mut length = 0;
         for (row, column) in first.iter().enumerate() {
-            begin.push(length);
-            length += row + 1 - column;
+            begin.push(length + column % LINE);
+            length += (row / LINE + 1 - column / LINE) * LINE;
         }
         begin.push(length);
-        Self { first, begin, values: vec![0.0; length] }
+        Self { first, begin, values: Aligned::zeros(length) }
     }
 
     /// Rows.
@@ -59,11 +63,11 @@ impl Envelope {
 
     /// Entry of the diagonal.
     pub(super) fn diagonal(&self, row: usize) -> f64 {
-        self.values[self.begin[row + 1] - 1]
+        self.at(row, row)
     }
 
     fn row(&self, row: usize) -> &[f64] {
-        &self.values[self.begin[row]..self.begin[row + 1]]
+        self.range(row, self.first[row], row + 1)
     }
 
     /// Factorises `self + diag(extra)` into `factor`, which has the same envelope; whether it is positive definite.
@@ -125,7 +129,8 @@ impl Rows<'_> {
     /// The rows before `row`, and the others.
     pub(super) fn split_at(self, row: usize) -> (Self, Self) {
         let Self { first, begin, from, values } = self;
-        let (before, others) = values.split_at_mut(begin[row] - begin[from]);
+        let at = line_of(first, begin, row) - line_of(first, begin, from);
+        let (before, others) = values.split_at_mut(at);
         (Self { first, begin, from, values: before }, Self { first, begin, from: row, values: others })
     }
 
@@ -138,9 +143,16 @@ impl Rows<'_> {
     /// `length` entries of a row from `column` on, which the envelope holds.
     #[inline(always)]
     pub(super) fn part_mut(&mut self, row: usize, column: usize, length: usize) -> &mut [f64] {
-        let at = self.begin[row] - self.begin[self.from] + column - self.first[row];
+        let begin = self.begin[row] - line_of(self.first, self.begin, self.from);
+        let at = begin + column - self.first[row];
         &mut self.values[at..at + length]
     }
+}
+
+/// Where the lines of a row begin; of one beyond the last, where those end.
+#[inline(always)]
+fn line_of(first: &[usize], begin: &[usize], row: usize) -> usize {
+    begin[row] - first.get(row).map_or(0, |first| first % LINE)
 }
 
 #[cfg(test)]

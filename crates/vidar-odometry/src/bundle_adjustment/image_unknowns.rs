@@ -12,8 +12,7 @@
 use super::image_prior::{ImagePrior, ImageUnknown, Process};
 use super::observation::MovingBody;
 use super::problem::{FRAME_DIM, Problem};
-use super::reprojections::Part;
-use super::system::{ByImage, ImageBlock, LandmarkBlock, ObservationBlock, System};
+use super::system::{ByImage, ImageBlock, LandmarkBlock, ObservationBlock, Part, System};
 use crate::backend::product;
 use nalgebra::{Matrix3, Vector3};
 

@@ -3,15 +3,11 @@
 use super::inertial::{GAIN_DIM, InertialJacobians};
 use super::landmark::Landmark;
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
+use super::reprojections::{self, KERNEL};
 use super::system::System;
-use super::{image_unknowns, observation, reprojections};
+use super::{image_unknowns, observation};
 use crate::backend::{GaugePriorSigmas, gauge_prior_at};
 use crate::imu::{Matrix15, Vector15};
-use vidar_solve::Kernel;
-
-/// Loss of whitened reprojection errors: quadratic to 2 standard deviations, then without influence in the end. Tracks of the
-/// front end have 2 to 5 % gross errors, which Huber's loss lets bend the path.
-pub(super) const KERNEL: Kernel = Kernel::Cauchy { k: 2.0 };
 
 /// Squared whitened error of an observation that does not project at all.
 const BEHIND: f64 = 100.0;

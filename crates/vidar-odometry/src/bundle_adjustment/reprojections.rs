@@ -5,15 +5,18 @@
 
 use super::envelope::Rows;
 use super::image_unknowns;
-use super::linearise::KERNEL;
 use super::observation::{self, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
-use super::system::{ByState, ImageBlock, LandmarkBlock, ObservationBlock, System};
+use super::system::{ByState, ImageBlock, LandmarkBlock, ObservationBlock, Part, System};
 use crate::backend::product;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
-use std::ops::Range;
 use vidar_core::simd::kernel;
+use vidar_solve::Kernel;
+
+/// Loss of whitened reprojection errors: quadratic to 2 standard deviations, then without influence in the end. Tracks of the
+/// front end have 2 to 5 % gross errors, which Huber's loss lets bend the path.
+pub(super) const KERNEL: Kernel = Kernel::Cauchy { k: 2.0 };
 
 /// Fewest landmarks that a thread takes at a time: some 50 µs of work.
 pub(super) const LANDMARKS_AT_A_TIME: usize = 32;
@@ -83,56 +86,6 @@ fn bounds(problem: &Problem, threads: usize) -> Vec<usize> {
     let offset = problem.calibration_offset();
     bounds.extend((offset..offset + problem.active_camera()).step_by(CALIBRATION_ROWS));
     bounds
-}
-
-/// Rows of the reduced system that one thread adds to.
-pub(super) struct Part<'a> {
-    /// States and unknowns of the camera whose rows they are.
-    pub(super) frames: Range<usize>,
-    pub(super) calibrations: Range<usize>,
-    pub(super) h: Rows<'a>,
-    /// The gradient from row `begin` on.
-    gradient: &'a mut [f64],
-    begin: usize,
-}
-
-impl<'a> Part<'a> {
-    fn of_all(problem: &Problem, h: Rows<'a>, gradient: &'a mut [f64]) -> Self {
-        let (frames, calibrations) = (0..problem.frames.len(), 0..problem.active_camera());
-        Self { frames, calibrations, h, gradient, begin: 0 }
-    }
-
-    /// The rows before `row`, and the others.
-    fn split_at(self, problem: &Problem, row: usize) -> (Self, Self) {
-        let Self { frames, calibrations, h, gradient, begin } = self;
-        let frame = (row / problem.frame_dim()).min(problem.frames.len());
-        let calibration = row.saturating_sub(problem.calibration_offset());
-        let (above, h) = h.split_at(row);
-        let (before, gradient) = gradient.split_at_mut(row - begin);
-        let first = Self {
-            frames: frames.start..frame,
-            calibrations: calibrations.start..calibration,
-            h: above,
-            gradient: before,
-            begin,
-        };
-        let (frames, calibrations) = (frame..frames.end, calibration..calibrations.end);
-        (first, Self { frames, calibrations, h, gradient, begin: row })
-    }
-
-    /// Entry of the gradient.
-    #[inline(always)]
-    pub(super) fn gradient(&mut self, row: usize) -> &mut f64 {
-        &mut self.gradient[row - self.begin]
-    }
-
-    /// Whether nothing of a landmark belongs to these rows.
-    fn is_beside(&self, block: &LandmarkBlock) -> bool {
-        let frame = |o: Option<&ObservationBlock>| o.map(|o| o.frame);
-        let (oldest, newest) = (frame(block.observations.first()), frame(block.observations.last()));
-        self.calibrations.is_empty()
-            && (oldest.is_none_or(|k| k >= self.frames.end) || newest.is_none_or(|k| k < self.frames.start))
-    }
 }
 
 #[inline(always)]

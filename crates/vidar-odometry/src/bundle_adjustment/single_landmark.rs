@@ -6,9 +6,10 @@
 //! envelope of modern methods for bundle adjustment").
 
 use super::landmark::Landmark;
-use super::linearise::{KERNEL, landmark_cost};
+use super::linearise::landmark_cost;
 use super::observation;
 use super::problem::{ObservedLandmark, Problem};
+use super::reprojections::KERNEL;
 use nalgebra::{Matrix3, Vector3};
 use std::convert::Infallible;
 use vidar_solve::levenberg_marquardt::{self, Decrease, Increase, LeastSquares, Limits, Schedule, Trial};

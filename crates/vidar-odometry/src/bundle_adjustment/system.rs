@@ -1,11 +1,12 @@
 //! The reduced normal equations of states and calibration, and what is kept of the landmarks that were eliminated.
 
-use super::envelope::Envelope;
+use super::envelope::{Envelope, Rows};
 use super::image_prior::IMAGE_DIM;
 use super::observation::STATE_DIM;
 use super::problem::{FRAME_DIM, Problem};
 use crate::backend::dot;
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
+use std::ops::Range;
 
 /// `Jᵀ J` between the unknowns of a state and a landmark.
 pub(super) type ByState = SMatrix<f64, STATE_DIM, 3>;
@@ -63,6 +64,56 @@ impl System {
     pub(super) fn sigma_of(&self, mut slope: Vec<f64>) -> f64 {
         self.factor.forward(&mut slope);
         dot(&slope, &slope).sqrt()
+    }
+}
+
+/// Rows of the reduced system that one thread adds to.
+pub(super) struct Part<'a> {
+    /// States and unknowns of the camera whose rows they are.
+    pub(super) frames: Range<usize>,
+    pub(super) calibrations: Range<usize>,
+    pub(super) h: Rows<'a>,
+    /// The gradient from row `begin` on.
+    gradient: &'a mut [f64],
+    begin: usize,
+}
+
+impl<'a> Part<'a> {
+    pub(super) fn of_all(problem: &Problem, h: Rows<'a>, gradient: &'a mut [f64]) -> Self {
+        let (frames, calibrations) = (0..problem.frames.len(), 0..problem.active_camera());
+        Self { frames, calibrations, h, gradient, begin: 0 }
+    }
+
+    /// The rows before `row`, and the others.
+    pub(super) fn split_at(self, problem: &Problem, row: usize) -> (Self, Self) {
+        let Self { frames, calibrations, h, gradient, begin } = self;
+        let frame = (row / problem.frame_dim()).min(problem.frames.len());
+        let calibration = row.saturating_sub(problem.calibration_offset());
+        let (above, h) = h.split_at(row);
+        let (before, gradient) = gradient.split_at_mut(row - begin);
+        let first = Self {
+            frames: frames.start..frame,
+            calibrations: calibrations.start..calibration,
+            h: above,
+            gradient: before,
+            begin,
+        };
+        let (frames, calibrations) = (frame..frames.end, calibration..calibrations.end);
+        (first, Self { frames, calibrations, h, gradient, begin: row })
+    }
+
+    /// Entry of the gradient.
+    #[inline(always)]
+    pub(super) fn gradient(&mut self, row: usize) -> &mut f64 {
+        &mut self.gradient[row - self.begin]
+    }
+
+    /// Whether nothing of a landmark belongs to these rows.
+    pub(super) fn is_beside(&self, block: &LandmarkBlock) -> bool {
+        let frame = |o: Option<&ObservationBlock>| o.map(|o| o.frame);
+        let (oldest, newest) = (frame(block.observations.first()), frame(block.observations.last()));
+        self.calibrations.is_empty()
+            && (oldest.is_none_or(|k| k >= self.frames.end) || newest.is_none_or(|k| k < self.frames.start))
     }
 }
 

@@ -1,6 +1,6 @@
 //! The inverse of an envelope's matrix within the envelope.
 
-use super::Envelope;
+use super::{Aligned, Envelope};
 use std::ops::Range;
 use vidar_core::simd::kernel;
 
@@ -23,7 +23,7 @@ impl Envelope {
         let mut z = Self {
             first: self.first.clone(),
             begin: self.begin.clone(),
-            values: vec![0.0; self.values.len()],
+            values: Aligned::zeros(self.values.len()),
         };
         // Last row of the band that reaches a column.
         let mut last: Vec<usize> = (0..self.dim()).collect();

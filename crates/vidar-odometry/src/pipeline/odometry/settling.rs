@@ -179,8 +179,16 @@ impl Odometry {
                 data_sheet: model.noise,
                 sigmas: &CalibrationSigmas::default(),
             };
-            newest_state(&input).ok()
+            on_one_thread(|| newest_state(&input).ok())
         };
         Some(Deferred::begin(due, solve))
+    }
+}
+
+/// Work that takes one processor: the others are the images' that go on.
+fn on_one_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
+        Ok(pool) => pool.install(work),
+        Err(_) => work(),
     }
 }
