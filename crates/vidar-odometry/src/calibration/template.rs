@@ -226,3 +226,41 @@ fn fits(image: &Image<u8>, centre: &Pixel, half: usize) -> bool {
         && centre.x + half + 1.0 < image.width() as f64 - 1.0
         && centre.y + half + 1.0 < image.height() as f64 - 1.0
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::testing::same_with_each_instruction_set;
+
+    /// Waves, brighter and with more contrast in the second image, which is shifted.
+    fn waves(shift: Pixel, gain: f64, offset: f64) -> Image<u8> {
+        Image::from_fn(64, 48, |x, y| {
+            let (x, y) = (x as f64 - shift.x, y as f64 - shift.y);
+            let wave = (0.31 * x + 0.12 * y).sin() + (0.27 * y - 0.09 * x).cos() + (0.17 * (x + y)).sin();
+            (offset + gain * wave).round() as u8
+        })
+    }
+
+    #[test]
+    fn a_patch_is_found_where_it_was_moved_to_whatever_the_instructions() {
+        let shift = Pixel::new(2.3, -1.6);
+        let (first, second) = (waves(Pixel::zeros(), 30.0, 100.0), waves(shift, 36.0, 120.0));
+        // The last one ends with the last column that a patch may have.
+        for at in [Pixel::new(20.25, 20.5), Pixel::new(30.0, 25.0), Pixel::new(52.9, 30.25)] {
+            let (place, ncc) = same_with_each_instruction_set(|| {
+                let found = Template::at(&first, &at).unwrap().find(&second, &at);
+                found.map(|(place, ncc)| ([place.x.to_bits(), place.y.to_bits()], ncc.to_bits())).unwrap()
+            });
+            let place = Pixel::new(f64::from_bits(place[0]), f64::from_bits(place[1]));
+            assert!((place - at - shift).norm() < 0.03, "{place:?} for {at:?}");
+            assert!(f64::from_bits(ncc) > 0.999);
+        }
+        assert!(Template::at(&first, &Pixel::new(6.9, 20.0)).is_none());
+        assert!(Template::at(&first, &Pixel::new(55.0, 20.0)).is_none());
+    }
+
+    #[test]
+    fn a_patch_without_texture_is_none() {
+        assert!(Template::at(&Image::from_fn(64, 48, |x, _| x as u8), &Pixel::new(20.0, 20.0)).is_none());
+    }
+}
