@@ -44,7 +44,7 @@ impl Envelope {
     /// All rows, to be split and added to.
     pub(super) fn rows(&mut self) -> Rows<'_> {
         let Self { first, begin, values } = self;
-        Rows { first, begin, from: 0, values }
+        Rows { first, begin, offset: 0, values }
     }
 
     /// Sets every entry to zero.
@@ -116,22 +116,23 @@ impl Envelope {
     }
 }
 
-/// Neighbouring rows of an envelope, from row `from` on.
+/// Neighbouring rows of an envelope.
 #[derive(Debug)]
 pub(super) struct Rows<'a> {
     first: &'a [usize],
     begin: &'a [usize],
-    from: usize,
     values: &'a mut [f64],
+    /// Where these begin among the envelope's.
+    offset: usize,
 }
 
 impl Rows<'_> {
     /// The rows before `row`, and the others.
     pub(super) fn split_at(self, row: usize) -> (Self, Self) {
-        let Self { first, begin, from, values } = self;
-        let at = line_of(first, begin, row) - line_of(first, begin, from);
-        let (before, others) = values.split_at_mut(at);
-        (Self { first, begin, from, values: before }, Self { first, begin, from: row, values: others })
+        let Self { first, begin, values, offset } = self;
+        let at = line_of(first, begin, row);
+        let (before, others) = values.split_at_mut(at - offset);
+        (Self { first, begin, values: before, offset }, Self { first, begin, values: others, offset: at })
     }
 
     /// As [`Envelope::add`].
@@ -143,8 +144,7 @@ impl Rows<'_> {
     /// `length` entries of a row from `column` on, which the envelope holds.
     #[inline(always)]
     pub(super) fn part_mut(&mut self, row: usize, column: usize, length: usize) -> &mut [f64] {
-        let begin = self.begin[row] - line_of(self.first, self.begin, self.from);
-        let at = begin + column - self.first[row];
+        let at = self.begin[row] - self.offset + column - self.first[row];
         &mut self.values[at..at + length]
     }
 }

@@ -288,13 +288,11 @@ impl Shape<'_> {
             let (mut by_a, mut by_b) =
                 products(three(common, block), lines(a, common - a_from), lines(b, common - b_from));
             // Columns of two states may begin apart.
-            if from.max(a_from) < common {
-                let begin = from.max(a_from);
-                add_each(&mut by_a, three(begin, common), &a[begin - a_from..common - a_from]);
-            }
-            if from.max(b_from) < common {
-                let begin = from.max(b_from);
-                add_each(&mut by_b, three(begin, common), &b[begin - b_from..common - b_from]);
+            for (sums, other, other_from) in [(&mut by_a, a, a_from), (&mut by_b, b, b_from)] {
+                let begin = from.max(other_from);
+                if begin < common {
+                    add_each(sums, three(begin, common), &other[begin - other_from..common - other_from]);
+                }
             }
             for r in 0..TOGETHER {
                 left[r][k] = rows[starts[r] + at + k] - total(&by_a[r]);
