@@ -42,7 +42,7 @@ pub(crate) fn track(
     cancel: &CancelToken,
     dump: Option<&mut dump::Dump>,
 ) -> Result<Tracked, Error> {
-    let mut passes = Passes { adjustable, events, cancel, dump };
+    let mut passes = Passes { adjustable, events, cancel, dump, has_tried_shifts: false };
     let mut config = recording.config.clone();
     if adjustable.is_some() {
         // The adjustment tells scattering stamps from stabilised images better than the window does, which is not asked.
@@ -54,7 +54,7 @@ pub(crate) fn track(
     if adjustable.is_none() || !tracked.is_contradicted() || cancel.is_cancelled() {
         return Ok(tracked);
     }
-    if recording.config.odometry.image_shift_deg.is_none() {
+    if recording.config.odometry.image_shift_deg.is_none() && !passes.has_tried_shifts {
         let mut config = config.clone();
         config.odometry.image_shift_deg = Some(IMAGE_SHIFT_RAD.to_degrees());
         let again = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
@@ -69,6 +69,20 @@ pub(crate) fn track(
     *factor = factor.max(DOUBTED_GYRO_NOISE_FACTOR);
     let again = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
     Ok(if again.explained().is_some() { again } else { tracked })
+}
+
+/// Images that a result may lack and another has: what is at either end depends on the clock that was found.
+const AT_THE_ENDS: usize = 5;
+
+/// Whether a result takes the place of an earlier one: it follows as many images, explains the recording as well and knows its scale better. Of five
+/// rendered stabilised phones that were tracked by a window that knows of shifts two were worse for it, by factors of 6 and 100, and stated so.
+fn is_better(again: &Tracked, first: &Tracked) -> bool {
+    let followed = |t: &Tracked| t.adjusted.as_ref().map_or(0, |a| a.images.len());
+    let scale_std = |t: &Tracked| t.adjusted.as_ref().map_or(f64::INFINITY, |a| a.scale_std);
+    followed(again) + AT_THE_ENDS >= followed(first)
+        && again.lost.len() <= first.lost.len()
+        && again.explained().is_some() >= first.explained().is_some()
+        && scale_std(again) <= scale_std(first)
 }
 
 /// A recording and its settings with the calibration that an adjustment found.
@@ -88,27 +102,34 @@ struct Passes<'a> {
     cancel: &'a CancelToken,
     /// Holds the last pass.
     dump: Option<&'a mut dump::Dump>,
+    /// Whether images were taken to be shifted, with the calibration as it was before all passes.
+    has_tried_shifts: bool,
 }
 
 impl Passes<'_> {
-    /// Feeds a recording to the odometry, and adjusts all states after its end. Where that leaves camera and IMU apart and the calibration is the
+    /// Feeds a recording to the odometry, and adjusts all states after its end. Where that leaves camera and IMU apart, or the track was lost, and the calibration is the
     /// recording's own, all of it happens once more with the calibration as adjusted.
     fn calibrated(&mut self, recording: &TrackingInput<'_>) -> Result<Tracked, Error> {
         let tracked = self.once(recording)?;
         let TrackingInput { dataset, config, map } = *recording;
-        let first = tracked.adjusted.as_ref().filter(|a| input::leaves_calibration_unchecked(dataset, a));
+        let is_unchecked = |a: &Adjusted| input::leaves_calibration_unchecked(dataset, a);
+        let is_own = dataset.calibration == CalibrationSource::Recording;
+        let is_lost = is_own && !tracked.lost.is_empty() && tracked.explained().is_some();
+        let first = tracked.adjusted.as_ref().filter(|a| is_lost || is_unchecked(a));
         let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else { return Ok(tracked) };
         let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
         let before = focal(dataset);
+        // What is not explained is known no better than anything else.
+        let is_doubted = is_unchecked(first);
         let (dataset, config) = as_adjusted(first, dataset, config);
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = Some([before, focal(&dataset)]);
-        Ok(if again.adjusted.is_some() { again } else { tracked })
+        let stands = if is_doubted { again.adjusted.is_some() } else { is_better(&again, &tracked) };
+        Ok(if stands { again } else { tracked })
     }
 
     /// Where the adjustment finds that image stamps scatter or images are shifted, all of it happens once more with an odometry that knows, and with
-    /// the calibration as adjusted where that is the recording's own. That result stands where it follows as many images and explains
-    /// the recording as well.
+    /// the calibration as adjusted where that is the recording's own and explains it. The better result stands.
     fn with_images_of_their_own(
         &mut self,
         recording: &TrackingInput<'_>,
@@ -126,9 +147,10 @@ impl Passes<'_> {
         let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else {
             return Ok(tracked);
         };
-        let is_own = dataset.calibration == CalibrationSource::Recording;
+        let is_adjusted = dataset.calibration == CalibrationSource::Recording && first.report.is_explained();
+        self.has_tried_shifts = shifted && !is_adjusted;
         let (dataset, mut config) =
-            if is_own { as_adjusted(first, dataset, config) } else { (dataset.clone(), config.clone()) };
+            if is_adjusted { as_adjusted(first, dataset, config) } else { (dataset.clone(), config.clone()) };
         let settings = &mut config.odometry;
         if scatter {
             settings.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
@@ -138,11 +160,7 @@ impl Passes<'_> {
         }
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = tracked.calibrated_again;
-        let followed = |t: &Tracked| t.adjusted.as_ref().map_or(0, |a| a.images.len());
-        let is_better = followed(&again) >= followed(&tracked)
-            && again.lost.len() <= tracked.lost.len()
-            && again.explained().is_some() >= tracked.explained().is_some();
-        Ok(if is_better { again } else { tracked })
+        Ok(if is_better(&again, &tracked) { again } else { tracked })
     }
 
     /// One pass.

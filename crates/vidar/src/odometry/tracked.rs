@@ -261,8 +261,8 @@ impl Tracked {
         }
         if let Some([before, after]) = self.calibrated_again {
             let text = format!(
-                "camera and IMU did not agree with the calibration found first (focal length {before:.1} px); the recording was tracked once more with the one \
-                 that their adjustment found ({after:.1} px)"
+                "with the calibration found first (focal length {before:.1} px) camera and IMU did not agree, or the track was lost; the recording was tracked once more \
+                 with the one that their adjustment found ({after:.1} px)"
             );
             warnings.push(Warning::new("calibrated-again", text));
         }
