@@ -5,7 +5,7 @@
 //! 1. The recording is calibrated as one without calibration is, with lens and mount held near the given ones.
 //! 2. Where that does not show the clock, an odometry looks for it in the first half minute.
 //!
-//! A recording that was calibrated from itself has step 2 alone.
+//! A recording that was calibrated from itself has step 2 alone, and only where that calibration does not know the clock.
 
 use crate::calibrate::{self, CONTRADICTING_SIGMAS};
 use crate::config::Config;
@@ -14,10 +14,20 @@ use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
 use vidar_core::{LieGroup, SensorEvent, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
+use vidar_odometry::bundle_adjustment::KnownImages;
 use vidar_odometry::{CameraTiming, ImuUse, Odometry};
 
 /// The stage's name in events.
 pub(crate) const STAGE: &str = "camera timing";
+
+/// What was settled, beside what `settle` corrects.
+#[derive(Debug, Default)]
+pub(crate) struct Settled {
+    /// That says what was corrected.
+    pub warning: Option<Warning>,
+    /// What images have of their own.
+    pub images: KnownImages,
+}
 
 /// Corrects `dataset`'s rig and `config`'s readout time where the images contradict the gyroscope, and says so.
 ///
@@ -28,31 +38,32 @@ pub(crate) fn settle(
     config: &mut Config,
     events: &Events,
     cancel: &CancelToken,
-) -> Result<Option<Warning>, Error> {
+) -> Result<Settled, Error> {
     let stated = dataset.readout.map(|r| 1e3 * r.as_secs_f64());
     config.odometry.readout_ms = config.odometry.readout_ms.or(stated);
     let settings = &config.odometry;
     let is_known =
         !settings.align_timing || (settings.readout_ms.is_some() && !settings.estimate_time_offset);
     if is_known || settings.imu == ImuUse::Off || dataset.rig.imu.is_none() {
-        return Ok(None);
+        return Ok(Settled::default());
     }
     let given = Given { dataset, config, events, cancel };
     // What was found from the recording is not found once more.
     let is_given = dataset.calibration != CalibrationSource::Recording;
-    let timing = match is_given.then(|| given.calibrated()).flatten() {
-        Some(timing) => timing,
-        None => given.searched()?,
+    let (timing, images) = match is_given.then(|| given.calibrated()).flatten() {
+        Some(found) => found,
+        None => (given.searched()?, KnownImages::default()),
     };
     // What half a minute shows is not to be given up for what the first seconds show.
     config.odometry.align_timing &= timing.sigmas_secs.is_none();
+    let nothing = Settled { warning: None, images };
     if !timing.is_corrected {
-        return Ok(None);
+        return Ok(nothing);
     }
-    let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(None) };
+    let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(nothing) };
     let turn = camera.body_from_camera.rotation.inverse() * timing.body_from_camera.rotation;
     timing.apply(camera, &mut config.odometry);
-    Ok(Some(corrected(&timing, turn.angle_rad().to_degrees())))
+    Ok(Settled { warning: Some(corrected(&timing, turn.angle_rad().to_degrees())), images })
 }
 
 /// A recording with the values that were given.
@@ -85,7 +96,7 @@ impl Given<'_> {
     }
 
     /// What the calibration of a recording finds with the given lens and mount.
-    fn calibrated(&self) -> Option<CameraTiming> {
+    fn calibrated(&self) -> Option<(CameraTiming, KnownImages)> {
         let Self { dataset, config, events, cancel } = *self;
         let found = calibrate::of_given_camera(dataset, events, cancel)?;
         let camera = dataset.rig.camera(dataset.camera)?;
@@ -102,13 +113,14 @@ impl Given<'_> {
         if is_turned {
             body_from_camera.rotation = found.body_from_camera;
         }
-        Some(CameraTiming {
+        let timing = CameraTiming {
             time_offset_secs: if is_other_clock { clock.value } else { given_secs },
             readout_secs: 1e-3 * readout_ms,
             body_from_camera,
             sigmas_secs: Some((clock.sigma, found.readout_secs.sigma)),
             is_corrected: is_other_clock || is_turned || settings.readout_ms.is_none() && readout_ms > 0.0,
-        })
+        };
+        Some((timing, calibrate::known_images(&found, settings)))
     }
 }
 

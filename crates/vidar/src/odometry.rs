@@ -95,8 +95,8 @@ pub fn odometry(
     let earlier_map = EarlierMap::of(&config)?;
     let mut dataset =
         events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
-    let sigmas = adjusted::adjustable(&dataset, &config);
-    calibrate::complete(&mut dataset, &mut config.odometry, events, cancel)?;
+    let mut sigmas = adjusted::adjustable(&dataset, &config);
+    let images = calibrate::complete(&mut dataset, &mut config.odometry, events, cancel)?;
     input::require_calibration(&dataset)?;
     let started_manifest = start_manifest(request, &dataset, started)?;
     let earlier = request.place.earlier(&started_manifest, &request.layered.to_toml(false))?;
@@ -105,7 +105,8 @@ pub fn odometry(
     folder.write_manifest(&started_manifest)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
-    let timing = settle_timing(&mut dataset, &mut config, events, cancel)?;
+    let settled = settle_timing(&mut dataset, &mut config, events, cancel)?;
+    sigmas.iter_mut().for_each(|sigmas| sigmas.images = images.or(settled.images));
     let recording = TrackingInput { dataset: &dataset, config: &config, map: earlier_map.as_ref() };
     let tracked = track(&recording, sigmas.as_ref(), events, cancel, dump.as_mut())?;
     let dumped = dump.is_some();
@@ -114,7 +115,7 @@ pub fn odometry(
     let trajectory = tracked.longest_segment();
     let scale = tracked.stated_scale(UnseenScale::of(&dataset, &config));
     let mut warnings = dataset.warnings.clone();
-    warnings.extend(timing);
+    warnings.extend(settled.warning);
     warnings.extend(tracked.warnings());
     warnings.extend(trajectory.as_ref().and_then(|_| scale.warning()));
     warnings.extend(input::truth_in_imu(&dataset).err().map(|e| input::not_evaluated("ground truth", &e)));
@@ -171,7 +172,7 @@ pub fn prepare(
 ) -> Result<Option<Warning>, Error> {
     calibrate::complete(dataset, &mut config.odometry, events, cancel)?;
     input::require_calibration(dataset)?;
-    settle_timing(dataset, config, events, cancel)
+    Ok(settle_timing(dataset, config, events, cancel)?.warning)
 }
 
 fn settle_timing(
@@ -179,7 +180,7 @@ fn settle_timing(
     config: &mut Config,
     events: &Events,
     cancel: &CancelToken,
-) -> Result<Option<Warning>, Error> {
+) -> Result<camera_timing::Settled, Error> {
     events.stage(camera_timing::STAGE, 0, || camera_timing::settle(dataset, config, events, cancel))
 }
 

@@ -49,12 +49,11 @@ pub(crate) use log::{LoggedState, TrackKey};
 pub(crate) use newest::{NewestState, newest_state};
 pub use progress::{AdjustmentStage, Progress};
 pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
-pub use sigmas::CalibrationSigmas;
+pub use sigmas::{CalibrationSigmas, KnownImages};
 
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
 use image_evidence::FoundImages;
-use image_prior::ImagePrior;
 use initial::Guess;
 use loops::Closed;
 use noise::WeighedImu;
@@ -69,7 +68,7 @@ use vidar_core::{Duration, RigCamera, Se3};
 /// Adjustments of all states at most: another one follows where the clock was corrected.
 const PASSES: usize = 3;
 /// The same where the clock still moves. Between the instant of a state and that of its row motion is extrapolated, which holds for some ms of a hand's
-/// tremor: a clock that an orbit had hidden, 68 ms off, came nearer by 1 to 7 ms a pass.
+/// tremor: a clock that an orbit had hidden, 68 ms off, came nearer by 1 to 7 ms a pass. Of states that do not settle it says nothing.
 const CLOCK_PASSES: usize = 10;
 
 /// Corrections of the clock below this are left in the row times, s.
@@ -163,7 +162,7 @@ pub fn adjust(
     watch.stage(AdjustmentStage::Together, work.guess.images.len());
     let mut passed = work.pass(&recording, &mut watch)?;
     let mut passes = 1;
-    while passes < if passed.is_settled { PASSES } else { CLOCK_PASSES } {
+    while passes < if passed.is_settled || !passed.has_converged() { PASSES } else { CLOCK_PASSES } {
         // One lens for all where it moves puts the camera elsewhere: the place is not judged by that.
         let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
         let is_moving = work.doubt_images(&passed.problem, &system);
@@ -259,6 +258,12 @@ struct Passed {
     is_settled: bool,
 }
 
+impl Passed {
+    fn has_converged(&self) -> bool {
+        self.report.iterations < optimise::MOST_ITERATIONS
+    }
+}
+
 impl Work {
     /// With the calibration as it was used last.
     fn new(input: &AdjustmentInput<'_>, guess: Guess) -> Self {
@@ -272,7 +277,7 @@ impl Work {
         let prior = CalibrationPrior {
             sigmas: input.sigmas.of(&calibration),
             mean: calibration.clone(),
-            image: ImagePrior::default(),
+            image: input.sigmas.images.into(),
         };
         Self { calibration, prior, clock_offset: input.camera.time_offset, guess }
     }

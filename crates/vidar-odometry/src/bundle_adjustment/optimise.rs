@@ -47,6 +47,9 @@ const INSIGNIFICANT: f64 = 0.5 * 0.1 * 0.1;
 /// The cost of healthy recordings settles within ten iterations.
 const LIMITS: Limits = Limits { iterations: 20, damping: 1e4, ..Limits::NONE };
 
+/// Iterations of an adjustment none of whose rounds has settled.
+pub(super) const MOST_ITERATIONS: usize = (ROUNDS + 1) * LIMITS.iterations;
+
 /// Squared whitened error, 2 degrees of freedom, beyond which an observation is left out: 99.9 %, and in the first round
 /// more, where states are still to settle.
 const OUTLIER_CHI2: [f64; ROUNDS] = [100.0, 25.0, 13.8];

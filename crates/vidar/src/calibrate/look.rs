@@ -120,7 +120,7 @@ fn look(
 
 /// The odometry looks for a clock itself where no better one than this is found, s: a stabilised phone's was found to 11 ms, and 6 ms off, one that circles a room
 /// to 60.
-const MOST_CLOCK_SIGMA_SECS: f64 = 0.015;
+pub(super) const MOST_CLOCK_SIGMA_SECS: f64 = 0.015;
 
 /// Whether what was found with a given lens explains the tracks with one near it.
 fn agrees_with_its_lens(found: &Calibration) -> bool {

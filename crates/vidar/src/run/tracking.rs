@@ -3,7 +3,7 @@
 
 use super::scene::SceneWriter;
 use crate::calibrate;
-use crate::camera_timing;
+use crate::camera_timing::{self, Settled};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use vidar_core::{Rig, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::OdometryConfig;
-use vidar_odometry::bundle_adjustment::CalibrationSigmas;
+use vidar_odometry::bundle_adjustment::{CalibrationSigmas, KnownImages};
 
 /// Where the result lies in the run folder: CBOR (RFC 8949) of [`Kept`].
 pub(super) const FILE: &str = "odometry/tracked.cbor";
@@ -103,7 +103,10 @@ impl Tracking {
         match &self.kept {
             Some(kept) => kept.calibrated.apply(dataset, config),
             None if !input::needs_calibration(config) => {}
-            None => calibrate::complete(dataset, &mut config.odometry, events, cancel)?,
+            None => {
+                let images = calibrate::complete(dataset, &mut config.odometry, events, cancel)?;
+                self.knows(images);
+            }
         }
         self.calibrated = Some(Calibrated::of(dataset, config));
         Ok(())
@@ -111,7 +114,7 @@ impl Tracking {
 
     /// Settles the camera's timing and tracks; none where the engine is to track while it maps.
     pub fn track(
-        self,
+        mut self,
         dataset: &mut Recording,
         config: &mut Config,
         folder: &RunFolder,
@@ -129,9 +132,10 @@ impl Tracking {
             }
             return Ok(Some(kept.poses));
         }
-        let timing = events
+        let Settled { warning: timing, images } = events
             .stage(camera_timing::STAGE, 0, || camera_timing::settle(dataset, config, events, cancel))?;
         timing.iter().for_each(|w| events.warn(w));
+        self.knows(images);
         let Some(sigmas) = &self.sigmas else { return Ok(None) };
         let recording = TrackingInput { dataset, config, map: self.map.as_ref() };
         let tracked = odometry::track(&recording, Some(sigmas), events, cancel, None)?;
@@ -153,6 +157,11 @@ impl Tracking {
             return Ok(Some(kept.poses));
         }
         Ok(Some(poses))
+    }
+
+    /// What was found of the images before tracking.
+    fn knows(&mut self, images: KnownImages) {
+        self.sigmas.iter_mut().for_each(|sigmas| sigmas.images = sigmas.images.or(images));
     }
 }
 

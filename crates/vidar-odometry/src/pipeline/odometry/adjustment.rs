@@ -2,8 +2,10 @@
 
 use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::{
-    self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, LoggedState, Progress, TrackLog,
+    self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, KnownImages, LoggedState, Progress,
+    TrackLog,
 };
+use crate::config::OdometryConfig;
 use crate::imu::{NavState, StepNoise};
 use crate::tracking::{host_covariance, noisy_covariance};
 use std::ops::ControlFlow;
@@ -97,10 +99,20 @@ impl Odometry {
             data_sheet,
             sigmas: &CalibrationSigmas {
                 principal_point_px: sigmas.principal_point_px / self.working.factor(),
+                images: sigmas.images.or(self.known_images()),
                 ..sigmas.clone()
             },
         };
         let adjusted = bundle_adjustment::adjust(&input, tell)?;
         self.working.restore_adjusted(adjusted).map_err(|_| AdjustmentError::Undetermined)
+    }
+
+    /// What the window takes images to have of their own.
+    pub(super) fn known_images(&self) -> KnownImages {
+        let OdometryConfig { image_shift_deg, stamp_scatter_ms, .. } = self.config;
+        KnownImages {
+            shift: image_shift_deg.filter(|s| *s > 0.0).map(f64::to_radians),
+            scatter_secs: stamp_scatter_ms.filter(|s| *s > 0.0).map(|ms| 1e-3 * ms),
+        }
     }
 }

@@ -168,6 +168,7 @@ impl Odometry {
         camera.time_offset += self.estimated_offset();
         let readout_secs = self.time_calibration.readout_secs;
         let given_body_from_camera = self.given_body_from_camera;
+        let images = self.known_images();
         let solve = move || {
             let input = AdjustmentInput {
                 log: &log,
@@ -177,7 +178,7 @@ impl Odometry {
                 // Gains are among the unknowns.
                 model: model.with_gyro_gain_std(0.0),
                 data_sheet: model.noise,
-                sigmas: &CalibrationSigmas::default(),
+                sigmas: &CalibrationSigmas { images, ..CalibrationSigmas::default() },
             };
             on_one_thread(|| newest_state(&input).ok())
         };
