@@ -147,33 +147,6 @@ fn odometry_calibrates_by_itself_and_says_so() {
     assert!(images("images_with_state") > 0.5 * images("images"), "{report}");
 }
 
-/// Twenty seconds of a slow hand whose focal length is first found 12 % off.
-#[test]
-#[ignore = "long: renders 400 images"]
-fn a_wrong_first_calibration_is_noticed_and_everything_is_tracked_again() {
-    let folder = tempfile::tempdir().unwrap();
-    let (sequence, out) = (folder.path().join("slow"), folder.path().join("out"));
-    let (sequence, out) = (sequence.to_str().unwrap(), out.to_str().unwrap());
-    let recorded = "--preset phone-slow --seed 906 --size 480x360 --frame-rate 20 --duration 20 --readout-ms 4 \
-                    --stamp-delay-ms=-25 --calibration absent -q";
-    let synth: Vec<&str> = ["synth", sequence].into_iter().chain(recorded.split_whitespace()).collect();
-    vidar(&synth).ends_with(0);
-    vidar(&["odometry", sequence, "-o", out, "--debug-dump"]).ends_with(0).says(&["calibrated-again"]);
-    let read = |name: &str| std::fs::read(folder.path().join("out/odometry").join(name)).unwrap();
-    let report: Value = serde_json::from_slice(&read("report.json")).unwrap();
-    let last = &report["final"];
-    let focal = number(&last["calibration"]["intrinsics"][0]);
-    assert!((focal / 365.3 - 1.0).abs() < 0.01, "focal length {focal}");
-    let error = number(&last["trajectory"]["scale_error"]).abs();
-    assert!(error < 3.0 * number(&report["scale"]["sigma"]), "{error}: {}", report["scale"]);
-    assert!(number(&last["trajectory"]["ate_se3_m"]["rmse"]) < 0.02, "{}", last["trajectory"]["ate_se3_m"]);
-    // The tables are those of the second time alone.
-    let states = String::from_utf8(read("debug_states.csv")).unwrap();
-    let times: Vec<i64> =
-        states.lines().skip(1).map(|l| l.split(',').next().unwrap().parse().unwrap()).collect();
-    assert!(times.is_sorted() && times.len() <= 400, "{} rows", times.len());
-}
-
 #[test]
 fn a_recording_that_shows_no_calibration_is_refused() {
     let folder = tempfile::tempdir().unwrap();

@@ -159,8 +159,13 @@ fn stabilised_images_are_tracked_all_the_same_and_told() {
         odometry(&sequence, &shared().root.join("stabilised live"), &["--set", "odometry.adjust=false"]);
     live.ends_with(3).says(&["odometry-never-started", "contradict each other"]);
     let out = shared().root.join("stabilised tracked");
-    let run = odometry(&sequence, &out, &[]).ends_with(0);
+    let run = odometry(&sequence, &out, &["--debug-dump"]).ends_with(0);
     assert_eq!(manifest(&out)["warnings"], serde_json::json!({ "images-stabilised": 1 }));
+    // The tables are those of the last time alone.
+    let states = std::fs::read_to_string(out.join("odometry/debug_states.csv")).unwrap();
+    let times: Vec<i64> =
+        states.lines().skip(1).map(|l| l.split(',').next().unwrap().parse().unwrap()).collect();
+    assert!(times.is_sorted() && times.len() <= 160, "{} rows", times.len());
     let json = run.json();
     assert!(json["quality"]["mapped_images"].as_u64().unwrap() >= 150, "{json}");
     let last = &json["final"]["trajectory"];
