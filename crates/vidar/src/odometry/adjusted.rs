@@ -96,15 +96,28 @@ pub(super) fn imu_json(adjusted: &Adjusted) -> Value {
     })
 }
 
-/// What was given and the recording contradicts: the values that were found are used.
-pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
+/// What was given and the recording contradicts: the values that were found are used. Of a recording that calibrated itself nothing was given.
+pub(super) fn warnings(adjusted: &Adjusted, is_self_calibrated: bool) -> Vec<Warning> {
+    let [is, given, hint] = if is_self_calibrated {
+        [
+            "was taken as",
+            "what was used at first",
+            "`vidar calibrate` tells how well it is known; --calibration FILE gives a better one",
+        ]
+    } else {
+        [
+            "is given as",
+            "what is given",
+            "`vidar calibrate` and a ruler show which is right; correct T_BS in the calibration",
+        ]
+    };
     let told = |finding: &AdjustmentFinding| {
         let text = match finding {
-            AdjustmentFinding::FocalLength(focus) => return focal_length(focus),
+            AdjustmentFinding::FocalLength(focus) => return focal_length(focus, given),
             AdjustmentFinding::Shifted { rms } => return shifted(*rms),
             AdjustmentFinding::StampsScatter { rms_secs } => return stamps_scatter(*rms_secs),
             AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m } => format!(
-                "the camera's position on the IMU is given as {} cm, the recording shows {} (σ {}) cm: {:.0} cm apart",
+                "the camera's position on the IMU {is} {} cm, the recording shows {} (σ {}) cm: {:.0} cm apart",
                 in_cm(given_m),
                 in_cm(found_m),
                 in_cm(sigma_m),
@@ -117,8 +130,7 @@ pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
             ),
             other => format!("the recording contradicts its calibration: {other:?}"),
         };
-        Warning::new("calibration-contradicted", format!("{text}; what was found is used"))
-            .hint("`vidar calibrate` and a ruler show which is right; correct T_BS in the calibration")
+        Warning::new("calibration-contradicted", format!("{text}; what was found is used")).hint(hint)
     };
     // Where something is not modelled, gains take up part of it and say nothing of the sensors.
     let gains = gains(&adjusted.imu).filter(|_| adjusted.report.is_explained());
@@ -159,13 +171,13 @@ fn gains(imu: &AdjustedImu) -> impl Iterator<Item = Warning> {
 /// recordings 0.05 to 0.1, where it changes 1.5 and more.
 const FIXED_FOCUS: f64 = 0.3;
 
-fn focal_length(focus: &Focus) -> Warning {
+fn focal_length(focus: &Focus, given: &str) -> Warning {
     let by = 100.0 * focus.mean.exp_m1();
     let direction = if by < 0.0 { "shorter" } else { "longer" };
     let by = by.abs();
     if focus.spread < FIXED_FOCUS * focus.mean.abs() {
         let text = format!(
-            "the focal length is {by:.1} % (σ {:.1} %) {direction} than what is given; what was found is used",
+            "the focal length is {by:.1} % (σ {:.1} %) {direction} than {given}; what was found is used",
             100.0 * focus.mean_sigma
         );
         return Warning::new("calibration-contradicted", text)
@@ -231,7 +243,7 @@ mod tests {
 
     #[test]
     fn a_lens_that_moves_is_told_apart_from_one_that_is_given_wrong() {
-        let told = |mean, spread| focal_length(&Focus { mean, mean_sigma: 1e-3, spread });
+        let told = |mean, spread| focal_length(&Focus { mean, mean_sigma: 1e-3, spread }, "what is given");
         let wrong = told(-0.02, 0.002);
         assert_eq!(wrong.kind, "calibration-contradicted");
         assert!(wrong.message.contains("2.0 % (σ 0.1 %) shorter than what is given"), "{}", wrong.message);

@@ -5,6 +5,7 @@ use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
+use std::convert::Infallible;
 use std::ops::ControlFlow;
 use std::time::Instant;
 use vidar_dataset::{CalibrationSource, Recording};
@@ -177,7 +178,10 @@ impl Passes<'_> {
                 });
                 if cancel.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             };
-            match events.stage(ADJUSTMENT, 0, || odometry.adjust_with(sigmas, &mut tell)) {
+            // One that fails took its time, too.
+            let Ok(adjusted) =
+                events.stage(ADJUSTMENT, 0, || Ok::<_, Infallible>(odometry.adjust_with(sigmas, &mut tell)));
+            match adjusted {
                 Ok(mut adjusted) if adjusted.is_consistent() => {
                     if let Some(joined) = odometry.place_in_map(&adjusted) {
                         adjusted.join(&joined);
@@ -209,7 +213,8 @@ impl Passes<'_> {
             odometry.keep_log();
         }
         let map = map.map(|m| MapUse { file: m.path.clone(), found_live_ns: None, matches: None });
-        let mut tracked = Tracked { with_imu, map, ..Tracked::default() };
+        let is_self_calibrated = dataset.calibration == CalibrationSource::Recording;
+        let mut tracked = Tracked { with_imu, is_self_calibrated, map, ..Tracked::default() };
         let total = dataset.images.len();
         let mut spent = 0.0;
         for measurement in input::measurements(dataset, true) {

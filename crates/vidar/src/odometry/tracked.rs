@@ -63,6 +63,8 @@ pub struct Tracked {
     pub carrier_share: f64,
     /// Errors of images that could not be read; they are skipped.
     pub unreadable: Vec<String>,
+    /// Whether the calibration is what the recording itself showed.
+    pub is_self_calibrated: bool,
     /// Whether camera and IMU were used together; else the trajectory is known up to scale.
     pub with_imu: bool,
     /// Health, coverage and scale over the whole recording.
@@ -266,7 +268,7 @@ impl Tracked {
             );
             warnings.push(Warning::new("calibrated-again", text));
         }
-        warnings.extend(self.adjusted.iter().flat_map(adjusted::warnings));
+        warnings.extend(self.adjusted.iter().flat_map(|a| adjusted::warnings(a, self.is_self_calibrated)));
         warnings.extend(self.map.iter().map(MapUse::warning));
         if !self.with_imu {
             let text =
