@@ -22,9 +22,6 @@ use vidar_odometry::calibration::{Calibration, SensorNoise, sensor_noise};
 /// The stage's name in events.
 pub(crate) const STAGE: &str = "calibrate";
 
-/// Standard deviation of a lever arm that nothing is known of, m: a phone's camera is as far from its IMU.
-pub const UNKNOWN_LEVER_M: f64 = 0.05;
-
 /// Clock offsets that are known better than this are kept by the odometry, s: a rendered slow phone, found within 0.1 ms,
 /// was lost when the odometry corrected it by 10 ms from a few seconds.
 const SETTLED_OFFSET_SECS: f64 = 0.0015;

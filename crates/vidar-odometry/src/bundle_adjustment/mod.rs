@@ -49,7 +49,7 @@ pub(crate) use log::{LoggedState, TrackKey};
 pub(crate) use newest::{NewestState, newest_state};
 pub use progress::{AdjustmentStage, Progress};
 pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
-pub use sigmas::{CalibrationSigmas, KnownImages};
+pub use sigmas::{CalibrationSigmas, KnownImages, UNKNOWN_LEVER_M};
 
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;

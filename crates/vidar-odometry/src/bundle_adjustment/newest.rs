@@ -39,6 +39,8 @@ pub(crate) struct NewestState {
     pub(crate) time_offset: Duration,
     /// From the first to the last row, s.
     pub(crate) readout_secs: f64,
+    /// Place of the camera on the body.
+    pub(crate) body_from_camera: Se3,
     /// Of the sensors as they are logged.
     pub(crate) gain: ImuGain,
 }
@@ -94,12 +96,13 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         frame: number(newest),
         state,
         sigmas: sigmas(&state, &Matrix15::from_fn(|a, b| covariance.entry(at + a, at + b))),
-        scale_std: result::log_scale_sigma(problem, &system),
+        scale_std: result::log_scale_sigma(problem, &system).max(result::arm_doubt(input, problem)),
         median_distance_m: median_distance(problem, newest).ok_or(AdjustmentError::Undetermined)?,
         states: problem.frames.iter().enumerate().map(|(k, f)| (number(k), f.body.state)).collect(),
         images: images.map(|(image, _, state)| (image, state.world_from_body)).collect(),
         time_offset,
         readout_secs: problem.calibration.readout_secs,
+        body_from_camera: problem.calibration.body_from_camera,
         gain: problem.calibration.gain,
     })
 }

@@ -296,7 +296,7 @@ const ASSUMED_POSITION_M: f64 = 0.03;
 /// σ(ln s) where the body's whole path is shorter than what was found of the camera's arm beyond what was given of it: a camera that goes round something and looks at it
 /// turns as one does on an arm of any length, and the accelerometer's bias takes up what is left. A stabilised phone that circled the middle of a hall at 5 m shrank to a path of
 /// 0.6 m about an arm of 0.15 m, at a formal σ of 3 %.
-fn arm_doubt(input: &AdjustmentInput<'_>, problem: &Problem) -> f64 {
+pub(super) fn arm_doubt(input: &AdjustmentInput<'_>, problem: &Problem) -> f64 {
     let found = problem.calibration.body_from_camera.translation;
     let is_assumed = input.sigmas.position_m > ASSUMED_POSITION_M;
     let given = if is_assumed { Vector3::zeros() } else { input.given_body_from_camera.translation };

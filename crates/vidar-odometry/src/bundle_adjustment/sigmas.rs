@@ -3,6 +3,11 @@
 use super::image_prior::ImagePrior;
 use super::observation::SensorCalibration;
 
+/// Standard deviation of a lever arm that nothing is known of, m: a phone's camera is as far from its IMU.
+pub const UNKNOWN_LEVER_M: f64 = 0.05;
+/// Standard deviation of a camera's rotation on the body that a recording's own tracks and gyroscope show, rad.
+const FOUND_ROTATION_RAD: f64 = 0.02;
+
 /// What may change of the camera: standard deviations of the given values, zero where they are held.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CalibrationSigmas {
@@ -74,6 +79,12 @@ impl Default for CalibrationSigmas {
 }
 
 impl CalibrationSigmas {
+    /// With a place of the camera on the body that nobody measured: its rotation was found from the recording, its position is not known.
+    #[must_use]
+    pub fn with_found_mount(self) -> Self {
+        Self { rotation_rad: FOUND_ROTATION_RAD, position_m: UNKNOWN_LEVER_M, ..self }
+    }
+
     pub(super) fn of(&self, calibration: &SensorCalibration) -> Vec<f64> {
         let mut sigmas = vec![self.time_offset_secs, self.readout_secs];
         sigmas.extend([self.rotation_rad; 3]);

@@ -1,10 +1,11 @@
 //! What was found, in words and as JSON.
 
 use super::yaml::{disagreement, told};
-use super::{CONTRADICTING_SIGMAS, CalibrateOutcome, Stated, UNKNOWN_LEVER_M};
+use super::{CONTRADICTING_SIGMAS, CalibrateOutcome, Stated};
 use nalgebra::Vector3;
 use serde_json::{Value, json};
 use vidar_core::{CameraModel, LieGroup};
+use vidar_odometry::bundle_adjustment::UNKNOWN_LEVER_M;
 use vidar_odometry::calibration::{Calibration, Estimate};
 
 /// One sentence for a warning.

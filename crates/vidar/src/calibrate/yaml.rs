@@ -1,9 +1,10 @@
 //! The calibration as a file of Kalibr's kind, camera and IMU in one, that `--calibration` reads.
 
-use super::{CalibrateOutcome, UNKNOWN_LEVER_M, used_readout_ms};
+use super::{CalibrateOutcome, used_readout_ms};
 use crate::imu_noise::believed_noise;
 use std::fmt::Write;
 use vidar_core::LieGroup;
+use vidar_odometry::bundle_adjustment::UNKNOWN_LEVER_M;
 use vidar_odometry::calibration::{Calibration, Estimate};
 
 impl CalibrateOutcome {

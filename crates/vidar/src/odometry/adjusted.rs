@@ -13,7 +13,6 @@ use vidar_odometry::bundle_adjustment::{
 /// Standard deviations of a calibration that was found from the recording's own tracks and gyroscope.
 const FOUND_FOCAL: f64 = 0.02;
 const FOUND_DISTORTION: f64 = 0.02;
-const FOUND_ROTATION_RAD: f64 = 0.02;
 /// Of the principal point, relative to the image's width: twice the error that was left on 29 rendered recordings
 /// (`bench/self_calibration.py`). Held, it turns the camera by up to half a degree, which the stated deviation does not know of.
 const FOUND_PRINCIPAL_POINT: f64 = 0.004;
@@ -27,11 +26,7 @@ pub(crate) fn adjustable(dataset: &Recording, config: &Config) -> Option<Calibra
     let readout = if settings.readout_ms.is_none() { by_default.readout_secs } else { 0.0 };
     let given = CalibrationSigmas { time_offset_secs: clock, readout_secs: readout, ..by_default };
     let has_no_mount = calibrate::has_no_mount(dataset);
-    let mounted = CalibrationSigmas {
-        rotation_rad: FOUND_ROTATION_RAD,
-        position_m: calibrate::UNKNOWN_LEVER_M,
-        ..given.clone()
-    };
+    let mounted = given.clone().with_found_mount();
     let sigmas = if dataset.calibration == CalibrationSource::Guessed
         || has_no_mount && calibrate::is_plain(dataset)
     {

@@ -134,7 +134,7 @@ impl Odometry {
         world_from_found: &Se3,
     ) {
         let pose = |image| found.pose_of(image).or_else(|| second?.pose_of(image));
-        let body_from_camera = &self.camera.body_from_camera;
+        let body_from_camera = &found.body_from_camera;
         self.settled =
             self.keyframes.moved(|image| Some(*world_from_found * pose(image)? * *body_from_camera));
     }
@@ -158,6 +158,12 @@ impl Odometry {
         self.imu_model.map(|_| TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()))
     }
 
+    /// What an adjustment may change of the camera: where its place on the body is refined on the way, nobody measured that.
+    fn known_camera(&self) -> CalibrationSigmas {
+        let known = CalibrationSigmas { images: self.known_images(), ..CalibrationSigmas::default() };
+        if self.config.estimate_extrinsics { known.with_found_mount() } else { known }
+    }
+
     /// Begins an adjustment of what was logged from `since` on.
     fn begin_newest_state(&self, since: Timestamp, due: Timestamp) -> Option<Deferred<Option<NewestState>>> {
         let (log, model) = (self.log.as_ref()?, self.imu_model?);
@@ -168,7 +174,7 @@ impl Odometry {
         camera.time_offset += self.estimated_offset();
         let readout_secs = self.time_calibration.readout_secs;
         let given_body_from_camera = self.given_body_from_camera;
-        let images = self.known_images();
+        let sigmas = self.known_camera();
         let solve = move || {
             let input = AdjustmentInput {
                 log: &log,
@@ -178,7 +184,7 @@ impl Odometry {
                 // Gains are among the unknowns.
                 model: model.with_gyro_gain_std(0.0),
                 data_sheet: model.noise,
-                sigmas: &CalibrationSigmas { images, ..CalibrationSigmas::default() },
+                sigmas: &sigmas,
             };
             on_one_thread(|| newest_state(&input).ok())
         };

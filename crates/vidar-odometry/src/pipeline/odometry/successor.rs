@@ -214,7 +214,11 @@ impl Odometry {
     pub(super) fn begin_successor_at(&mut self, begun: NewestState) -> Option<()> {
         let now = self.recent.frames.back()?.frame.time;
         let at = self.recent.frames.iter().position(|f| f.id == begun.frame)?;
-        let camera = RigCamera { time_offset: begun.time_offset, ..self.camera.clone() };
+        let camera = RigCamera {
+            time_offset: begun.time_offset,
+            body_from_camera: begun.body_from_camera,
+            ..self.camera.clone()
+        };
         let imu = self.imu.multiplied(&begun.gain.beyond(&self.imu_gain));
         let mut odometry = self.second(camera, begun.readout_secs.max(0.0), imu, begun.gain);
         odometry.begin_at(&begun, &self.recent.frames[at].frame)?;
