@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Duration, ImuNoise, Pinhole, RigCamera, Se3, Warning};
 use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::OdometryConfig;
-use vidar_odometry::bundle_adjustment::{IMAGE_SHIFT_RAD, KnownImages};
+use vidar_odometry::bundle_adjustment::{IMAGE_SHIFT_RAD, ImagePrior};
 use vidar_odometry::calibration::{Calibration, SensorNoise, sensor_noise};
 
 /// The stage's name in events.
@@ -184,8 +184,8 @@ pub(crate) fn complete(
     settings: &mut OdometryConfig,
     events: &Events,
     cancel: &CancelToken,
-) -> Result<KnownImages, Error> {
-    let nothing = KnownImages::default();
+) -> Result<ImagePrior, Error> {
+    let nothing = ImagePrior::default();
     let Some(missing) = MissingCalibration::of(dataset) else { return Ok(nothing) };
     let has_lens = missing == MissingCalibration::Mount;
     let found = match look::what_is_missing(missing, dataset, events, cancel) {
@@ -226,17 +226,17 @@ pub(crate) fn complete(
         Warning::new("calibrated-from-recording", report::sentence(&found, has_lens))
             .hint("`vidar calibrate` writes it to a file; --calibration FILE gives a better one"),
     );
-    Ok(known_images(&found, settings))
+    Ok(image_prior(&found, settings))
 }
 
 /// Images that a calibration finds shifted by more than this (root mean square, rad) are known to be: it finds 0.008 to 0.014 in rendered stabilised phones, and 0.0045 where stamps scatter.
 const STABILISED_RAD: f64 = 0.006;
 
 /// What a calibration found of the images, where `settings` leave that open.
-pub(crate) fn known_images(found: &Calibration, settings: &OdometryConfig) -> KnownImages {
+pub(crate) fn image_prior(found: &Calibration, settings: &OdometryConfig) -> ImagePrior {
     let is_open = settings.image_shift_deg.is_none();
     let is_shifted = is_open && found.image_shift_rad.is_some_and(|shift| shift > STABILISED_RAD);
-    KnownImages { shift: is_shifted.then_some(IMAGE_SHIFT_RAD), ..KnownImages::default() }
+    ImagePrior { shift: is_shifted.then_some(IMAGE_SHIFT_RAD), ..ImagePrior::default() }
 }
 
 /// What calibrating `dataset` gives, as a sentence; the error is why it gives nothing that would be used unasked.

@@ -14,7 +14,7 @@ use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
 use vidar_core::{LieGroup, SensorEvent, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
-use vidar_odometry::bundle_adjustment::KnownImages;
+use vidar_odometry::bundle_adjustment::ImagePrior;
 use vidar_odometry::{CameraTiming, ImuUse, Odometry};
 
 /// The stage's name in events.
@@ -26,7 +26,7 @@ pub(crate) struct Settled {
     /// That says what was corrected.
     pub warning: Option<Warning>,
     /// What images have of their own.
-    pub images: KnownImages,
+    pub images: ImagePrior,
 }
 
 /// Corrects `dataset`'s rig and `config`'s readout time where the images contradict the gyroscope, and says so.
@@ -52,7 +52,7 @@ pub(crate) fn settle(
     let is_given = dataset.calibration != CalibrationSource::Recording;
     let (timing, images) = match is_given.then(|| given.calibrated()).flatten() {
         Some(found) => found,
-        None => (given.searched()?, KnownImages::default()),
+        None => (given.searched()?, ImagePrior::default()),
     };
     // What half a minute shows is not to be given up for what the first seconds show.
     config.odometry.align_timing &= timing.sigmas_secs.is_none();
@@ -96,7 +96,7 @@ impl Given<'_> {
     }
 
     /// What the calibration of a recording finds with the given lens and mount.
-    fn calibrated(&self) -> Option<(CameraTiming, KnownImages)> {
+    fn calibrated(&self) -> Option<(CameraTiming, ImagePrior)> {
         let Self { dataset, config, events, cancel } = *self;
         let found = calibrate::of_given_camera(dataset, events, cancel)?;
         let camera = dataset.rig.camera(dataset.camera)?;
@@ -120,7 +120,7 @@ impl Given<'_> {
             sigmas_secs: Some((clock.sigma, found.readout_secs.sigma)),
             is_corrected: is_other_clock || is_turned || settings.readout_ms.is_none() && readout_ms > 0.0,
         };
-        Some((timing, calibrate::known_images(&found, settings)))
+        Some((timing, calibrate::image_prior(&found, settings)))
     }
 }
 

@@ -60,12 +60,7 @@ pub(super) fn moves(problem: &Problem, system: &System) -> Option<ImagePrior> {
 fn log_bayes_factor(problem: &Problem, system: &System, new: ImagePrior) -> Option<f64> {
     let without = Fit::of(system);
     let mut with = problem.clone();
-    let known = &mut with.prior.image;
-    *known = ImagePrior {
-        focal: known.focal.or(new.focal),
-        shift: known.shift.or(new.shift),
-        delay: known.delay.or(new.delay),
-    };
+    with.prior.image = with.prior.image.or(new);
     let with = Fit::of(&optimise::solution(&with)?);
     let occam = 0.5 * (log_det(problem, &new) - (with.log_det - without.log_det));
     Some(with.decrease - without.decrease + occam)

@@ -3,16 +3,16 @@
 /// Most unknowns of an image.
 pub(super) const IMAGE_DIM: usize = 6;
 
-/// What is known before of how the lens moves while filming, and of how stamps scatter (see [`super::image_unknowns`]); nothing of it is unknown where they
+/// What is known before of how the lens moves while filming, and of how stamps scatter; nothing of it is unknown where they
 /// do not.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct ImagePrior {
+pub struct ImagePrior {
     /// Standard deviation of `ln` of an image's focal length over the calibration's, where it changes.
-    pub(super) focal: Option<f64>,
+    pub focal: Option<f64>,
     /// Standard deviation of an image's shift in x and in y, focal lengths, where it is shifted; it has a rate, too.
-    pub(super) shift: Option<f64>,
+    pub shift: Option<f64>,
     /// Standard deviation of how much later than its stamp says an image was exposed, s, where stamps scatter.
-    pub(super) delay: Option<f64>,
+    pub delay: Option<f64>,
 }
 
 /// How long a lens keeps its place, s: autofocus moves every few seconds, stabilisation with each tremor of the hand. Part of a stamp's error is that of the
@@ -43,6 +43,16 @@ pub(super) struct Process {
 }
 
 impl ImagePrior {
+    /// What is known here, else there.
+    #[must_use]
+    pub fn or(self, other: Self) -> Self {
+        Self {
+            focal: self.focal.or(other.focal),
+            shift: self.shift.or(other.shift),
+            delay: self.delay.or(other.delay),
+        }
+    }
+
     /// Unknowns of an image.
     pub(super) fn dim(&self) -> usize {
         usize::from(self.focal.is_some())

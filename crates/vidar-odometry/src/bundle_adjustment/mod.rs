@@ -43,13 +43,14 @@ mod thin;
 pub use findings::AdjustmentFinding;
 pub use image_evidence::{Focus, IMAGE_SHIFT_RAD, STAMP_SCATTER_SECS};
 pub(crate) use image_evidence::{HARMFUL_DELAY, HARMFUL_SHIFT};
+pub use image_prior::ImagePrior;
 pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};
 pub(crate) use newest::{NewestState, newest_state};
 pub use progress::{AdjustmentStage, Progress};
 pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
-pub use sigmas::{CalibrationSigmas, KnownImages, UNKNOWN_LEVER_M};
+pub use sigmas::{CalibrationSigmas, UNKNOWN_LEVER_M};
 
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
@@ -277,7 +278,7 @@ impl Work {
         let prior = CalibrationPrior {
             sigmas: input.sigmas.of(&calibration),
             mean: calibration.clone(),
-            image: input.sigmas.images.into(),
+            image: input.sigmas.images,
         };
         Self { calibration, prior, clock_offset: input.camera.time_offset, guess }
     }

@@ -29,32 +29,9 @@ pub struct CalibrationSigmas {
     pub gyro_gain: f64,
     /// Gain of the accelerometer, relative, per axis.
     pub accel_gain: f64,
-    /// What images have of their own.
-    pub images: KnownImages,
-}
-
-/// What images are known to have of their own. Of the rest the adjustment asks the recording, once all states fit as if there were none: an error that large leads clock, readout and
-/// lever arm away from where they were, and what follows begins there.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct KnownImages {
-    /// Standard deviation of how far a stabiliser shifts an image, focal lengths.
-    pub shift: Option<f64>,
-    /// Standard deviation of image stamps, s.
-    pub scatter_secs: Option<f64>,
-}
-
-impl KnownImages {
-    /// What is known here, else there.
-    #[must_use]
-    pub fn or(self, other: Self) -> Self {
-        Self { shift: self.shift.or(other.shift), scatter_secs: self.scatter_secs.or(other.scatter_secs) }
-    }
-}
-
-impl From<KnownImages> for ImagePrior {
-    fn from(known: KnownImages) -> Self {
-        Self { focal: None, shift: known.shift, delay: known.scatter_secs }
-    }
+    /// What images are known to have of their own. Of the rest the adjustment asks the recording, once all states fit as if there were none: an error that large leads clock,
+    /// readout and lever arm away from where they were, and what follows begins there.
+    pub images: ImagePrior,
 }
 
 impl Default for CalibrationSigmas {
@@ -73,7 +50,7 @@ impl Default for CalibrationSigmas {
             distortion: 0.0,
             gyro_gain: 0.01,
             accel_gain: 0.005,
-            images: KnownImages::default(),
+            images: ImagePrior::default(),
         }
     }
 }

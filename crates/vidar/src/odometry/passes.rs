@@ -113,19 +113,21 @@ impl Passes<'_> {
     fn calibrated(&mut self, recording: &TrackingInput<'_>) -> Result<Tracked, Error> {
         let tracked = self.once(recording)?;
         let TrackingInput { dataset, config, map } = *recording;
-        let is_unchecked = |a: &Adjusted| input::leaves_calibration_unchecked(dataset, a);
-        let is_own = dataset.calibration == CalibrationSource::Recording;
-        let is_lost = is_own && !tracked.lost.is_empty() && tracked.explained().is_some();
-        let first = tracked.adjusted.as_ref().filter(|a| is_lost || is_unchecked(a));
-        let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else { return Ok(tracked) };
+        let Some(first) = tracked.adjusted.as_ref().filter(|_| !self.cancel.is_cancelled()) else {
+            return Ok(tracked);
+        };
+        let is_unchecked = input::leaves_calibration_unchecked(dataset, first);
+        let is_lost = tracked.is_self_calibrated && !tracked.lost.is_empty() && first.report.is_explained();
+        if !is_unchecked && !is_lost {
+            return Ok(tracked);
+        }
         let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
         let before = focal(dataset);
-        // What is not explained is known no better than anything else.
-        let is_doubted = is_unchecked(first);
         let (dataset, config) = as_adjusted(first, dataset, config);
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = Some([before, focal(&dataset)]);
-        let stands = if is_doubted { again.adjusted.is_some() } else { is_better(&again, &tracked) };
+        // The σ that a doubtful calibration led to is none to compare with.
+        let stands = if is_unchecked { again.adjusted.is_some() } else { is_better(&again, &tracked) };
         Ok(if stands { again } else { tracked })
     }
 
@@ -148,7 +150,7 @@ impl Passes<'_> {
         let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else {
             return Ok(tracked);
         };
-        let is_adjusted = dataset.calibration == CalibrationSource::Recording && first.report.is_explained();
+        let is_adjusted = tracked.is_self_calibrated && first.report.is_explained();
         self.has_tried_shifts = shifted && !is_adjusted;
         let (dataset, mut config) =
             if is_adjusted { as_adjusted(first, dataset, config) } else { (dataset.clone(), config.clone()) };

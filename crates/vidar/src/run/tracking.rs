@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use vidar_core::{Rig, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::OdometryConfig;
-use vidar_odometry::bundle_adjustment::{CalibrationSigmas, KnownImages};
+use vidar_odometry::bundle_adjustment::{CalibrationSigmas, ImagePrior};
 
 /// Where the result lies in the run folder: CBOR (RFC 8949) of [`Kept`].
 pub(super) const FILE: &str = "odometry/tracked.cbor";
@@ -160,7 +160,7 @@ impl Tracking {
     }
 
     /// What was found of the images before tracking.
-    fn knows(&mut self, images: KnownImages) {
+    fn knows(&mut self, images: ImagePrior) {
         self.sigmas.iter_mut().for_each(|sigmas| sigmas.images = sigmas.images.or(images));
     }
 }

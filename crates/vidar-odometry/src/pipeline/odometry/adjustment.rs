@@ -2,10 +2,9 @@
 
 use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::{
-    self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, KnownImages, LoggedState, Progress,
+    self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, ImagePrior, LoggedState, Progress,
     TrackLog,
 };
-use crate::config::OdometryConfig;
 use crate::imu::{NavState, StepNoise};
 use crate::tracking::{host_covariance, noisy_covariance};
 use std::ops::ControlFlow;
@@ -99,7 +98,7 @@ impl Odometry {
             data_sheet,
             sigmas: &CalibrationSigmas {
                 principal_point_px: sigmas.principal_point_px / self.working.factor(),
-                images: sigmas.images.or(self.known_images()),
+                images: sigmas.images.or(self.image_prior()),
                 ..sigmas.clone()
             },
         };
@@ -108,11 +107,8 @@ impl Odometry {
     }
 
     /// What the window takes images to have of their own.
-    pub(super) fn known_images(&self) -> KnownImages {
-        let OdometryConfig { image_shift_deg, stamp_scatter_ms, .. } = self.config;
-        KnownImages {
-            shift: image_shift_deg.filter(|s| *s > 0.0).map(f64::to_radians),
-            scatter_secs: stamp_scatter_ms.filter(|s| *s > 0.0).map(|ms| 1e-3 * ms),
-        }
+    pub(super) fn image_prior(&self) -> ImagePrior {
+        let window = self.config.smoother();
+        ImagePrior { focal: None, shift: window.image_shift_sigma(), delay: window.delay_sigma() }
     }
 }

@@ -160,7 +160,7 @@ impl Odometry {
 
     /// What an adjustment may change of the camera: where its place on the body is refined on the way, nobody measured that.
     fn known_camera(&self) -> CalibrationSigmas {
-        let known = CalibrationSigmas { images: self.known_images(), ..CalibrationSigmas::default() };
+        let known = CalibrationSigmas { images: self.image_prior(), ..CalibrationSigmas::default() };
         if self.config.estimate_extrinsics { known.with_found_mount() } else { known }
     }
 

@@ -3,8 +3,15 @@
 use super::{adjust, ate_m, logged_with, settings, told};
 use std::ops::ControlFlow;
 use vidar_core::OdometryKeyframe;
-use vidar_odometry::bundle_adjustment::{AdjustmentFinding, Focus, IMAGE_SHIFT_RAD, KnownImages};
-use vidar_odometry::simulate::{Simulation, SimulationConfig};
+use vidar_odometry::bundle_adjustment::{Adjusted, AdjustmentFinding, Focus, IMAGE_SHIFT_RAD, ImagePrior};
+use vidar_odometry::simulate::{Logged, Simulation, SimulationConfig};
+
+/// A flight and its adjustment.
+fn flown(seed: u64, secs: f64, config: &SimulationConfig) -> (Logged, Adjusted) {
+    let flight = logged_with(seed, secs, 1.0, 0.0, config, &settings());
+    let adjusted = adjust(&flight, &settings());
+    (flight, adjusted)
+}
 
 fn focus(finding: &AdjustmentFinding) -> Option<Focus> {
     if let AdjustmentFinding::FocalLength(focus) = finding { Some(*focus) } else { None }
@@ -15,8 +22,7 @@ fn a_focal_length_that_changes_is_found_in_every_image() {
     let (mut ln_s_nees, flights) = (0.0, 4);
     let config = SimulationConfig { log_focal: [0.0, 0.015], ..SimulationConfig::default() };
     for seed in 0..flights {
-        let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
-        let adjusted = adjust(&flight, &settings());
+        let (flight, adjusted) = flown(seed, 12.0, &config);
         let found = told(&adjusted, focus);
         // A sine has 0.7 of its amplitude.
         assert!(
@@ -41,8 +47,7 @@ fn a_stabilised_lens_is_found_in_every_image() {
     let (mut ln_s_nees, flights) = (0.0, 2);
     let config = SimulationConfig { shift: 0.008, ..SimulationConfig::default() };
     for seed in 0..flights {
-        let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
-        let adjusted = adjust(&flight, &settings());
+        let (flight, adjusted) = flown(seed, 12.0, &config);
         // Two sines in quadrature have one's amplitude.
         let rms = told(&adjusted, shift_rms);
         assert!((rms - 0.008).abs() < 0.001 && adjusted.findings.len() == 1, "{:?}", adjusted.findings);
@@ -70,7 +75,7 @@ fn shift_rms(finding: &AdjustmentFinding) -> Option<f64> {
 fn a_stabiliser_that_is_known_is_not_looked_for() {
     let config = SimulationConfig { shift: 0.02, ..SimulationConfig::default() };
     let flight = logged_with(1, 12.0, 1.0, 0.0, &config, &settings());
-    let adjust = |images: KnownImages| {
+    let adjust = |images: ImagePrior| {
         let mut settings = settings();
         settings.sigmas.images = images;
         let mut iterations = 0;
@@ -81,8 +86,8 @@ fn a_stabiliser_that_is_known_is_not_looked_for() {
         let adjusted = flight.adjust(&settings, &mut count).unwrap();
         (adjusted, iterations)
     };
-    let (asked, asked_iterations) = adjust(KnownImages::default());
-    let (known, iterations) = adjust(KnownImages { shift: Some(IMAGE_SHIFT_RAD), ..KnownImages::default() });
+    let (asked, asked_iterations) = adjust(ImagePrior::default());
+    let (known, iterations) = adjust(ImagePrior { shift: Some(IMAGE_SHIFT_RAD), ..ImagePrior::default() });
     println!(
         "{iterations} iterations, {asked_iterations} where it is asked; {:.4} m",
         ate_m(&flight, &known)
@@ -98,8 +103,7 @@ fn stamps_that_scatter_are_found_for_every_image() {
     let (mut ln_s_nees, flights) = (0.0, 3);
     let config = SimulationConfig { stamp_scatter_secs: 0.005, ..SimulationConfig::default() };
     for seed in 0..flights {
-        let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
-        let adjusted = adjust(&flight, &settings());
+        let (flight, adjusted) = flown(seed, 12.0, &config);
         let rms = told(&adjusted, |f| match f {
             AdjustmentFinding::StampsScatter { rms_secs } => Some(*rms_secs),
             _ => None,
@@ -119,8 +123,7 @@ fn stamps_that_scatter_are_found_for_every_image() {
 fn a_focal_length_that_is_given_wrong_is_found_and_told() {
     for (seed, off) in [(1, 0.02), (2, -0.015)] {
         let config = SimulationConfig { log_focal: [off, 0.0], ..SimulationConfig::default() };
-        let flight = logged_with(seed, 10.0, 1.0, 0.0, &config, &settings());
-        let adjusted = adjust(&flight, &settings());
+        let (flight, adjusted) = flown(seed, 10.0, &config);
         let found = told(&adjusted, focus);
         assert!((found.mean - off).abs() < 4.0 * found.mean_sigma.max(2e-4), "flight {seed}: {found:?}");
         assert!(found.spread < 0.2 * off.abs(), "flight {seed}: {found:?}");
